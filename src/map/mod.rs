@@ -1,0 +1,1 @@
+//! Drawing the flat map: rasters of every layer, tile by tile.

@@ -1,0 +1,1 @@
+//! Unit normals that face the void.

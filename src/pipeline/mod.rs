@@ -1,0 +1,1 @@
+//! The whole run: pipeline file, stages in order, limits, report, run folder.

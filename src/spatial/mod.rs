@@ -1,0 +1,1 @@
+//! Spatial searches: who is near whom.
