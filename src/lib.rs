@@ -4,24 +4,24 @@
 //! A module uses only the modules above it (`tests/architecture.rs` checks that).
 
 // What everything stands on.
+pub mod warning;
 pub mod numeric;
 pub mod spatial;
-pub mod warning;
 
 // What happens to a scan, in order.
-pub mod axis;
-pub mod clean;
 pub mod cloud;
-pub mod cut;
-pub mod lift;
-pub mod map;
-pub mod mesh;
+pub mod clean;
+pub mod axis;
 pub mod normals;
 pub mod segment;
+pub mod mesh;
+pub mod cut;
 pub mod unwrap;
+pub mod map;
+pub mod lift;
 
 // Where scans come from and where products go.
-pub mod cli;
+pub mod synthetic;
 pub mod io;
 pub mod pipeline;
-pub mod synthetic;
+pub mod cli;
