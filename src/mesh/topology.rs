@@ -167,8 +167,7 @@ pub fn components(twin: &[u32]) -> (Vec<u32>, usize) {
         component[seed] = count;
         stack.push(seed);
         while let Some(f) = stack.pop() {
-            for c in 3 * f..3 * f + 3 {
-                let other = twin[c];
+            for &other in &twin[3 * f..3 * f + 3] {
                 if other != NO_TWIN && component[(other / 3) as usize] == u32::MAX {
                     component[(other / 3) as usize] = count;
                     stack.push((other / 3) as usize);
