@@ -1,1 +1,28 @@
-//! Reading and writing files: one file of this folder per format.
+//! Where scans come from and where products go: one file per format.
+//!
+//! Reading is complete and suspicious: no count in a header is believed before the file is known to hold it, panics in
+//! decoders end as bad input, and whatever is dropped, scaled or guessed is counted in the [`Summary`].
+
+mod assemble;
+mod crs;
+mod detect;
+mod error;
+mod file_scan;
+mod guards;
+mod label_column;
+mod las;
+pub mod ply;
+mod mesh_scan;
+mod point_table;
+mod quiet_panics;
+mod source_bytes;
+mod write;
+
+pub use assemble::{FileSummary, Summary, read_cloud};
+pub use error::{Error, ErrorKind};
+pub use file_scan::{AttributeInfo, Settings, Unit};
+pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
+pub use write::{PointColumns, WriteSummary, write_cloud, write_points};
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,399 @@
+//! Files into one cloud: one frame, one unit, equal columns.
+
+use super::detect::{self, Format};
+use super::error::Error;
+use super::file_scan::{FileScan, Settings};
+use super::guards::{self, PointGuards};
+use super::source_bytes::SourceBytes;
+use super::{las, ply};
+use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile, Station};
+use crate::numeric::Vec3;
+use crate::warning::Warning;
+use serde::Serialize;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+
+/// What was read.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// The files in the order in which they were given.
+    pub files: Vec<FileSummary>,
+    /// Points of the cloud.
+    pub points: usize,
+    /// Names of the attribute columns that the cloud has.
+    pub attributes: Vec<&'static str>,
+    /// Length of a scan unit in metres.
+    pub metres_per_unit: f64,
+    /// Origin of the local frame in scan coordinates.
+    pub origin_in_scan: [f64; 3],
+    /// Lowest and highest scan coordinates.
+    pub bounds_in_scan: [[f64; 3]; 2],
+    /// Coordinate reference system as the files state it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub crs: Option<String>,
+    /// Scanner positions known from the files.
+    pub stations: usize,
+    /// What a person should know.
+    pub warnings: Vec<Warning>,
+}
+
+/// What one file gave.
+#[derive(Clone, Debug, Serialize)]
+pub struct FileSummary {
+    /// The file.
+    pub path: PathBuf,
+    /// Its format, e.g. `LAZ`.
+    pub format: &'static str,
+    /// Version of the format, where it has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub version: Option<String>,
+    /// Records in the file.
+    pub records: u64,
+    /// Points read from it.
+    pub points: usize,
+    /// Records that gave no point (not a number, or no echo).
+    pub dropped: usize,
+    /// Column that labels came from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label_column: Option<String>,
+    /// Suspicious points.
+    pub guards: PointGuards,
+}
+
+/// Reads one or several files as one scan, in a local frame in metres.
+///
+/// Points come in the order of the files and of their records. The origin of the frame lies on whole units near the
+/// first file.
+///
+/// # Errors
+/// [`Error`] names the first file that cannot be used, why, and what to do: missing, empty, truncated or contradictory
+/// files, coordinates in degrees, files with different coordinate reference systems, no points at all.
+pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summary), Error> {
+    let mut whole: Option<Whole> = None;
+    let mut warnings = Vec::new();
+    for path in files {
+        let origin = whole.as_ref().map(|w| w.scan.origin);
+        let mut scan = read_file(path, settings, origin)?;
+        refuse_degrees(path, &scan, settings)?;
+        let (guards, mut found) = guards::inspect(&scan);
+        found.splice(0..0, std::mem::take(&mut scan.warnings));
+        for mut warning in found {
+            if files.len() > 1 {
+                warning.message = format!("{}: {}", path.display(), warning.message);
+            }
+            warnings.push(warning);
+        }
+        match &mut whole {
+            None => whole = Some(Whole::first(path, scan, guards)),
+            Some(whole) => whole.append(path, scan, guards, &mut warnings)?,
+        }
+    }
+    let whole = whole.ok_or_else(|| Error::Settings {
+        key: "--input",
+        cause: "no scan was named".into(),
+        remedy: "name one or several files".into(),
+    })?;
+    whole.finish(settings, warnings)
+}
+
+/// Reads one file of any format; a panic in a decoder ends as bad input.
+pub(super) fn read_file(path: &Path, settings: &Settings, origin: Option<Vec3>) -> Result<FileScan, Error> {
+    contained(path, || {
+        let source = SourceBytes::open(path)?;
+        match detect::format_of(&source)? {
+            Format::Las => las::read(&source, settings, origin),
+            Format::Ply => ply::read(&source, settings, origin),
+        }
+    })
+}
+
+/// Runs a reader; whatever panics in it (decoders of other crates do on damaged files) ends as bad input.
+pub(super) fn contained<T>(path: &Path, read: impl FnOnce() -> Result<T, Error>) -> Result<T, Error> {
+    super::quiet_panics::quietly(|| catch_unwind(AssertUnwindSafe(read))).unwrap_or_else(|panic| {
+        let message = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied())
+            .unwrap_or("no message");
+        Err(Error::bad(path, format!("its content breaks the decoder ({message})"), super::error::COPY_AGAIN))
+    })
+}
+
+fn refuse_degrees(path: &Path, scan: &FileScan, settings: &Settings) -> Result<(), Error> {
+    let Some(crs) = scan.info.crs.as_ref().filter(|c| c.degrees && settings.unit.is_none()) else { return Ok(()) };
+    let name: String = crs.text.chars().take(60).collect();
+    Err(Error::bad(
+        path,
+        format!("its coordinates are degrees ({name}), not lengths"),
+        "reproject it to a metric system, e.g. `pdal translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:\
+         <UTM zone>`, or set ingest.unit if the statement is wrong",
+    ))
+}
+
+struct Whole {
+    scan: FileScan,
+    sources: Vec<SourceFile>,
+    files: Vec<FileSummary>,
+    low: Vec3,
+    high: Vec3,
+}
+
+impl Whole {
+    fn first(path: &Path, scan: FileScan, guards: PointGuards) -> Self {
+        let mut whole = Self {
+            sources: Vec::new(),
+            files: Vec::new(),
+            low: Vec3::repeat(f64::INFINITY),
+            high: Vec3::repeat(f64::NEG_INFINITY),
+            scan,
+        };
+        let (points, dropped, info) =
+            (whole.scan.positions.len(), std::mem::take(&mut whole.scan.dropped_records), whole.scan.info.clone());
+        whole.note(path, 0, points, whole.scan.record_count, dropped, &info, guards);
+        whole
+    }
+
+    #[allow(clippy::too_many_arguments, reason = "one row of a table")]
+    fn note(
+        &mut self,
+        path: &Path,
+        first_point: usize,
+        points: usize,
+        records: u64,
+        dropped: Vec<u64>,
+        info: &super::file_scan::FileInfo,
+        guards: PointGuards,
+    ) {
+        self.files.push(FileSummary {
+            path: path.to_owned(),
+            format: info.format,
+            version: info.version.clone(),
+            records,
+            points,
+            dropped: dropped.len(),
+            label_column: info.label_column.clone(),
+            guards,
+        });
+        if let Some([low, high]) = info.bounds {
+            self.low = self.low.inf(&low.into());
+            self.high = self.high.sup(&high.into());
+        }
+        self.sources.push(SourceFile {
+            path: path.to_owned(),
+            first_point,
+            point_count: points,
+            record_count: records,
+            dropped_records: dropped,
+        });
+    }
+
+    fn append(
+        &mut self,
+        path: &Path,
+        scan: FileScan,
+        guards: PointGuards,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<(), Error> {
+        check_same_crs(&self.files[0].path, &self.scan, path, &scan, warnings)?;
+        let before = self.scan.positions.len();
+        let added = scan.positions.len();
+        let FileScan { positions, attributes, stations, record_count, dropped_records, info, .. } = scan;
+        self.scan.positions.extend(positions);
+        let first_station = self.scan.stations.len() as u16;
+        let mine = &mut self.scan.attributes;
+        let context = Append { before, added, path, first: self.files.is_empty() };
+        const GREY: [u16; 3] = [0x8080; 3];
+        context.column("colours", &mut mine.colors, attributes.colors, GREY, Some("mid grey"), warnings);
+        context.column("intensities", &mut mine.intensities, attributes.intensities, 0, Some("0"), warnings);
+        context.column("classes", &mut mine.classifications, attributes.classifications, 0, None, warnings);
+        context.column("source ids", &mut mine.source_ids, attributes.source_ids, 0, None, warnings);
+        context.column("labels", &mut mine.labels, attributes.labels, 0, Some("unlabelled"), warnings);
+        let ids = attributes.station_ids.map(|ids| ids.into_iter().map(|i| i.saturating_add(first_station)).collect());
+        context.column("stations", &mut mine.station_ids, ids, u16::MAX, Some("unknown"), warnings);
+        self.scan.stations.extend(stations);
+        self.note(path, before, added, record_count, dropped_records, &info, guards);
+        Ok(())
+    }
+
+    fn finish(self, settings: &Settings, mut warnings: Vec<Warning>) -> Result<(Cloud, Summary), Error> {
+        let Self { mut scan, sources, files, low, high } = self;
+        let path = &files[0].path;
+        if scan.positions.is_empty() {
+            let dropped: usize = files.iter().map(|f| f.dropped).sum();
+            let cause = if dropped > 0 {
+                format!("none of its {dropped} records is a point")
+            } else {
+                "it has no points".into()
+            };
+            return Err(Error::bad(path, cause, "export the scan again, with its points"));
+        }
+        let metres_per_unit = unit_of(&scan, settings, &mut warnings);
+        if metres_per_unit != 1.0 {
+            scan.positions.iter_mut().for_each(|p| *p *= metres_per_unit);
+            scan.stations.iter_mut().for_each(|s| s.position_in_local *= metres_per_unit);
+        } else if settings.unit.is_none() {
+            guess_unit(&(high - low), &mut warnings);
+        }
+        settle_attributes(&mut scan.attributes, &mut warnings);
+        let crs = scan.info.crs.map(|c| c.text);
+        let frame = ScanFrame { origin_in_scan: scan.origin, metres_per_unit, crs: crs.clone() };
+        let stations: Vec<Station> = scan.stations;
+        let summary = Summary {
+            points: scan.positions.len(),
+            attributes: names(&scan.attributes),
+            metres_per_unit,
+            origin_in_scan: scan.origin.into(),
+            bounds_in_scan: [low.into(), high.into()],
+            crs,
+            stations: stations.len(),
+            files,
+            warnings,
+        };
+        let path = summary.files[0].path.clone();
+        let cloud = Cloud::new(frame, scan.positions, scan.attributes, sources, stations)
+            .map_err(|e| Error::bad(&path, e.to_string(), super::error::COPY_AGAIN))?;
+        Ok((cloud, summary))
+    }
+}
+
+struct Append<'a> {
+    before: usize,
+    added: usize,
+    path: &'a Path,
+    first: bool,
+}
+
+impl Append<'_> {
+    /// Appends a column; where only one side has it, the other is filled and that is said.
+    fn column<T: Clone>(
+        &self,
+        name: &str,
+        mine: &mut Option<Vec<T>>,
+        theirs: Option<Vec<T>>,
+        fill: T,
+        filled_with: Option<&str>,
+        warnings: &mut Vec<Warning>,
+    ) {
+        debug_assert!(!self.first);
+        let one_sided = mine.is_some() != theirs.is_some();
+        if let Some(filled_with) = filled_with.filter(|_| one_sided) {
+            let who = if mine.is_some() { "has no" } else { "is the first file with" };
+            warnings.push(Warning::new(
+                "mixed-attributes",
+                format!("{} {who} {name}; points of files without them are {filled_with}", self.path.display()),
+            ));
+        }
+        match (mine.as_mut(), theirs) {
+            (None, None) => {}
+            (Some(mine), Some(theirs)) => mine.extend(theirs),
+            (Some(mine), None) => mine.resize(self.before + self.added, fill),
+            (None, Some(theirs)) => {
+                let mut column = vec![fill; self.before];
+                column.extend(theirs);
+                *mine = Some(column);
+            }
+        }
+    }
+}
+
+fn check_same_crs(
+    first_path: &Path,
+    first: &FileScan,
+    path: &Path,
+    scan: &FileScan,
+    warnings: &mut Vec<Warning>,
+) -> Result<(), Error> {
+    match (&first.info.crs, &scan.info.crs) {
+        (Some(a), Some(b)) if a.text != b.text => {
+            let short = |t: &str| t.chars().take(60).collect::<String>();
+            Err(Error::bad(
+                path,
+                format!(
+                    "its coordinate reference system ({}) differs from that of '{}' ({})",
+                    short(&b.text),
+                    first_path.display(),
+                    short(&a.text)
+                ),
+                "reproject the files to one system, or read them apart",
+            ))
+        }
+        (Some(_), None) | (None, Some(_)) => {
+            warnings.push(Warning::new(
+                "mixed-crs",
+                format!(
+                    "only one of '{}' and '{}' states a coordinate reference system; they are taken to agree",
+                    first_path.display(),
+                    path.display()
+                ),
+            ));
+            Ok(())
+        }
+        _ => Ok(()),
+    }
+}
+
+fn unit_of(scan: &FileScan, settings: &Settings, warnings: &mut Vec<Warning>) -> f64 {
+    if let Some(unit) = settings.unit {
+        return unit.metres();
+    }
+    let stated = scan.info.crs.as_ref().and_then(|c| c.metres_per_unit).unwrap_or(1.0);
+    if (stated - 1.0).abs() > 1e-12 {
+        warnings.push(Warning::new(
+            "unit",
+            format!(
+                "the coordinate reference system states a unit of {stated} m; lengths are converted to metres \
+                 (set ingest.unit = \"metre\" if that is wrong)"
+            ),
+        ));
+    }
+    stated
+}
+
+/// Tunnels are 1 m to 100 km long; other extents point to another unit.
+fn guess_unit(extent: &Vec3, warnings: &mut Vec<Warning>) {
+    let longest = extent.amax();
+    let shortest = extent.amin();
+    if longest > 2000.0 && shortest > 500.0 {
+        warnings.push(Warning::new(
+            "unit-guess",
+            format!(
+                "the scan measures {:.0} x {:.0} x {:.0} units: if these are millimetres, \
+                 set ingest.unit = \"millimetre\"",
+                extent.x, extent.y, extent.z
+            ),
+        ));
+    }
+}
+
+/// All-zero colours and intensities are no measurement; 8-bit colours in 16-bit fields are scaled.
+fn settle_attributes(attributes: &mut Attributes, warnings: &mut Vec<Warning>) {
+    if let Some(colors) = &mut attributes.colors {
+        let largest = colors.iter().flatten().copied().max().unwrap_or(0);
+        if largest == 0 {
+            warnings.push(Warning::new("no-colors", "all colours are zero and are treated as absent"));
+            attributes.colors = None;
+        } else if largest <= 255 {
+            warnings.push(Warning::new(
+                "eight-bit-colors",
+                format!("colours reach only {largest} of 65535: they are 8-bit values and are scaled by 257"),
+            ));
+            colors.iter_mut().flatten().for_each(|c| *c *= 257);
+        }
+    }
+    if attributes.intensities.as_ref().is_some_and(|i| i.iter().all(|&i| i == 0)) {
+        warnings.push(Warning::new("no-intensities", "all intensities are zero and are treated as absent"));
+        attributes.intensities = None;
+    }
+}
+
+fn names(attributes: &Attributes) -> Vec<&'static str> {
+    let all = [
+        ("color", attributes.colors.is_some()),
+        ("intensity", attributes.intensities.is_some()),
+        ("classification", attributes.classifications.is_some()),
+        ("source_id", attributes.source_ids.is_some()),
+        ("label", attributes.labels.is_some()),
+        ("station", attributes.station_ids.is_some()),
+    ];
+    all.iter().filter(|a| a.1).map(|a| a.0).collect()
+}

@@ -1,0 +1,37 @@
+//! Which format a file has: by its first bytes where they tell, by its name where they do not.
+
+use super::error::Error;
+use super::source_bytes::SourceBytes;
+use std::path::Path;
+
+/// The formats that are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Format {
+    Las,
+    Ply,
+}
+
+/// Lower-case extension of a path.
+pub(super) fn extension(path: &Path) -> String {
+    path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default()
+}
+
+/// The format of an opened file.
+pub(super) fn format_of(source: &SourceBytes) -> Result<Format, Error> {
+    let head = source.up_to(0, 16)?;
+    if head.starts_with(b"LASF") {
+        return Ok(Format::Las);
+    }
+    if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
+        return Ok(Format::Ply);
+    }
+    match extension(source.path()).as_str() {
+        "las" | "laz" => Ok(Format::Las),
+        "ply" => Ok(Format::Ply),
+        other => {
+            let cause =
+                if other.is_empty() { "its format is unknown".into() } else { format!("'.{other}' is unknown") };
+            Err(Error::unsupported(source.path(), cause, "export the scan as LAS, LAZ or PLY"))
+        }
+    }
+}

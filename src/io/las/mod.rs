@@ -1,0 +1,20 @@
+//! LAS 1.0 to 1.4 and LAZ: all point formats, extra bytes, coordinate systems; records are rewritten bit for bit.
+//!
+//! When to use: the default format of scans and of the lifted points.
+//! Reference: ASPRS, *LAS Specification 1.4 - R15* (2019); M. Isenburg, *LASzip: lossless compression of lidar data*,
+//! Photogrammetric Engineering & Remote Sensing 79 (2013), 209-217. The arithmetic decoding is done by the `laz` crate;
+//! everything around it (header, records, chunks, columns) is done here, so that nothing is lost on the way back.
+//! Guarantees: no header count is trusted before the file is known to hold it; chunks decode in parallel into disjoint
+//! slots, so columns are the same on any number of threads.
+//! Cost: one pass over the file; working memory of one piece (a few hundred kB) a thread besides the columns, plus the
+//! compressed chunk for LAZ.
+
+mod crs;
+mod extra_bytes;
+mod header;
+mod read;
+mod records;
+mod rewrite;
+
+pub(super) use read::read;
+pub(super) use rewrite::{rewrite, write_new};
