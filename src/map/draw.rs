@@ -1,0 +1,697 @@
+//! The walk over the map: piece by piece, all layers of a piece together.
+
+use super::blend::{self, BlendedTile, Reach, Scatter, Support};
+use super::layer::{
+    COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, Layer, LayerDescription, Look, NoData, Resampling, SampleType,
+    Samples, palette,
+};
+use super::rasterize::{FaceIndex, NO_FACE, SurfaceTile};
+use super::sampling::{ScatterIndex, Spacing};
+use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, distortion, relief};
+use crate::cloud::{Cloud, ScanFrame};
+use crate::numeric::{Vec2, statistics};
+use crate::unwrap::Chart;
+use crate::warning::Warning;
+use rayon::prelude::*;
+
+/// Pieces computed at the same time; bounds the memory, whatever the number of threads.
+const PIECES_AT_ONCE: usize = 4;
+/// Automatic limit of the distance from the surface: this many times the 90 % quantile, within bounds in metres.
+const OFFSET_LIMIT: f64 = 5.0;
+const OFFSET_LIMIT_BOUNDS_M: (f64, f64) = (0.05, 0.3);
+/// Steps of the offset layer, metres: far below any scanner's noise, and it lets the file be compressed.
+const OFFSET_STEP_M: f64 = 1.0 / 8192.0;
+/// Pixel size of charts without scan points, as a share of the mean edge length.
+const CELL_PER_EDGE: f64 = 0.25;
+
+/// Where the points of a cloud lie on the map.
+#[derive(Clone, Copy, Debug)]
+pub struct PointsOnMap<'a> {
+    /// Chart coordinates of each point; NaN for a point that has no place on the surface.
+    pub uv: &'a [Vec2],
+    /// Signed distance of each point from the surface in metres.
+    pub offsets_m: &'a [f64],
+}
+
+/// What a map is drawn from.
+#[derive(Clone, Copy, Debug)]
+pub struct DrawInput<'a> {
+    /// The flattened surface.
+    pub chart: &'a Chart,
+    /// The scan and the place of its points on the chart, unless the map is made from a mesh alone.
+    pub points: Option<(&'a Cloud, PointsOnMap<'a>)>,
+    /// Frame of the scan coordinates (for [`Layer::Xyz`]).
+    pub frame: &'a ScanFrame,
+    /// Signed distance of each vertex of the chart from the local mean section in metres, positive into the void.
+    /// Needed by the layers offset and relief.
+    pub section_offsets_m: Option<&'a [f64]>,
+}
+
+/// A finished piece of the map: one column of samples for each layer, in the order of the descriptions.
+#[derive(Debug)]
+pub struct Piece {
+    /// Where. Aligned to tiles of [`super::TILE_PX`] pixels.
+    pub rect: PixelRect,
+    /// Samples of each layer.
+    pub layers: Vec<Samples>,
+}
+
+/// Takes the pieces of a map: rows of pieces from the top, each row from left to right.
+pub trait Sink {
+    /// Called once before the first piece.
+    ///
+    /// # Errors
+    /// Whatever keeps the sink from taking pieces.
+    fn begin(&mut self, grid: &Grid, layers: &[LayerDescription]) -> Result<(), SinkError>;
+
+    /// Takes the next pieces, in order, all of one row of pieces.
+    ///
+    /// # Errors
+    /// Whatever keeps the sink from taking them.
+    fn take(&mut self, pieces: Vec<Piece>) -> Result<(), SinkError>;
+
+    /// Called once after the last piece.
+    ///
+    /// # Errors
+    /// Whatever keeps the sink from finishing.
+    fn finish(&mut self) -> Result<(), SinkError>;
+}
+
+/// What a [`Sink`] failed with.
+pub type SinkError = Box<dyn std::error::Error + Send + Sync>;
+
+/// Draws the layers of the settings over the whole chart and hands them to `sink` piece by piece.
+///
+/// Layers that the input cannot give (colour of a scan without colour) are left out with a warning.
+///
+/// # Errors
+/// [`Error::Cell`], [`Error::GridTooLarge`] and [`Error::Length`] for input that does not fit, [`Error::Sink`] when
+/// the writer fails.
+pub fn draw(input: &DrawInput, settings: &Settings, sink: &mut dyn Sink) -> Result<Summary, Error> {
+    let plan = Plan::new(input, settings)?;
+    sink.begin(&plan.grid, &plan.layers).map_err(Error::Sink)?;
+    let mut counts = Counts::default();
+    for row in plan.grid.work_rows() {
+        for rects in row.chunks(PIECES_AT_ONCE) {
+            let drawn: Vec<(Piece, Counts)> = rects.par_iter().map(|&rect| plan.draw_piece(rect)).collect();
+            let mut pieces = Vec::with_capacity(drawn.len());
+            for (piece, part) in drawn {
+                counts.observed += part.observed;
+                counts.filled += part.filled;
+                counts.empty += part.empty;
+                pieces.push(piece);
+            }
+            sink.take(pieces).map_err(Error::Sink)?;
+        }
+    }
+    sink.finish().map_err(Error::Sink)?;
+    Ok(plan.summary(&counts))
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Counts {
+    observed: usize,
+    filled: usize,
+    empty: usize,
+}
+
+/// Everything that is the same for all pieces.
+struct Plan<'a> {
+    input: &'a DrawInput<'a>,
+    grid: Grid,
+    faces: FaceIndex,
+    scatter: Option<(Scatter<'a>, Reach)>,
+    shade: Vec<f32>,
+    stretch: Vec<[f32; 4]>,
+    layers: Vec<LayerDescription>,
+    max_offset_m: f64,
+    points_off_surface: usize,
+    points_unanchored: usize,
+    offset_range_m: f64,
+    stretch_range: f64,
+    warnings: Vec<Warning>,
+}
+
+impl<'a> Plan<'a> {
+    fn new(input: &'a DrawInput<'a>, settings: &Settings) -> Result<Self, Error> {
+        let mesh = input.chart.strip().mesh();
+        let vertices = mesh.vertices().len();
+        if let Some(found) = input.section_offsets_m.map(<[f64]>::len).filter(|&n| n != vertices) {
+            return Err(Error::Length { column: "the distance from the mean section", found, expected: vertices });
+        }
+        if let Some((cloud, points)) = input.points {
+            for (column, found) in [("the place on the map", points.uv.len()), ("the offset", points.offsets_m.len())] {
+                if found != cloud.len() {
+                    return Err(Error::Length { column, found, expected: cloud.len() });
+                }
+            }
+        }
+        let mut warnings = Vec::new();
+        let (low, high) = extent(input.chart);
+
+        let max_offset_m = settings.max_offset_m.unwrap_or_else(|| automatic_max_offset(input));
+        let (mut points_off_surface, mut points_unanchored) = (0, 0);
+        let mut sampled = None;
+        if let Some((cloud, points)) = input.points {
+            for (uv, offset) in points.uv.iter().zip(points.offsets_m) {
+                if !(uv.x.is_finite() && uv.y.is_finite()) {
+                    points_unanchored += 1;
+                } else if !is_on_surface(*offset, max_offset_m) {
+                    points_off_surface += 1;
+                }
+            }
+            let index = ScatterIndex::new(points.uv, |i| is_on_surface(points.offsets_m[i], max_offset_m));
+            sampled = Spacing::measure(&index).map(|spacing| (cloud, index, spacing));
+            if sampled.is_none() {
+                let message = format!("none of {} scan points lies on the map, so nothing colours it", cloud.len());
+                warnings.push(Warning::new("map-without-points", message));
+            }
+        }
+        let cell_m = settings.cell_m.unwrap_or_else(|| match &sampled {
+            Some((_, _, spacing)) => automatic_cell_m(spacing.typical[0], spacing.typical[1], high - low),
+            None => {
+                let edge = (4.0 / 3f64.sqrt() * mesh.area() / mesh.faces().len().max(1) as f64).sqrt() * CELL_PER_EDGE;
+                automatic_cell_m(edge, edge, high - low)
+            }
+        });
+        let grid = Grid::covering(low, high, cell_m)?;
+        let faces = FaceIndex::new(input.chart, &grid);
+
+        let wanted = wanted_layers(input, settings, sampled.is_some(), &mut warnings);
+        let offset_range_m = input.section_offsets_m.map_or(0.1, |offsets| {
+            let mut sizes: Vec<f64> = offsets.iter().map(|o| o.abs()).filter(|o| o.is_finite()).collect();
+            super::grid::next_in_series(statistics::quantile(&mut sizes, 0.98).unwrap_or(0.1).max(0.01))
+        });
+        let shade = match input.section_offsets_m {
+            Some(offsets) if wanted.contains(&Layer::Relief) => relief::shade_vertices(input.chart, offsets),
+            _ => Vec::new(),
+        };
+        let stretch: Vec<[f32; 4]> = if wanted.contains(&Layer::Distortion) {
+            (0..mesh.faces().len() as u32).into_par_iter().map(|f| distortion::of_face(input.chart, f)).collect()
+        } else {
+            Vec::new()
+        };
+        let stretch_range = stretch_range(&stretch);
+        let layers: Vec<LayerDescription> =
+            wanted.iter().map(|&layer| describe(layer, input, offset_range_m, stretch_range)).collect();
+        let has = |layer| wanted.contains(&layer);
+        let scatter = sampled.map(|(cloud, index, spacing)| {
+            let reach = Reach::new(&spacing, settings.fill_m, cell_m);
+            let (colors, intensities) = (has(Layer::Color), has(Layer::Intensity));
+            let labels = has(Layer::Labels) && cloud.attributes().labels.is_some();
+            (Scatter { index, spacing, cloud, colors, intensities, labels }, reach)
+        });
+        Ok(Self {
+            input,
+            grid,
+            faces,
+            scatter,
+            shade,
+            stretch,
+            layers,
+            max_offset_m,
+            points_off_surface,
+            points_unanchored,
+            offset_range_m,
+            stretch_range,
+            warnings,
+        })
+    }
+
+    fn draw_piece(&self, rect: PixelRect) -> (Piece, Counts) {
+        let surface = self.faces.rasterize(self.input.chart, &self.grid, rect);
+        let blended = self
+            .scatter
+            .as_ref()
+            .map(|(scatter, reach)| blend::blend(scatter, &self.grid, reach, rect, |i| surface.faces[i] != NO_FACE));
+        let coverage = self.coverage(&surface, blended.as_ref());
+        let mut counts = Counts::default();
+        for (i, &class) in coverage.iter().enumerate() {
+            counts.observed += usize::from(class == COVERAGE_OBSERVED);
+            counts.filled += usize::from(class == COVERAGE_FILLED);
+            let supported = blended.as_ref().is_none_or(|b| b.support[i] != Support::None);
+            counts.empty += usize::from(class != COVERAGE_NONE && !supported);
+        }
+        let layers = self.layers.iter().map(|d| self.samples(d.layer, &surface, blended.as_ref(), &coverage)).collect();
+        (Piece { rect, layers }, counts)
+    }
+
+    fn coverage(&self, surface: &SurfaceTile, blended: Option<&BlendedTile>) -> Vec<u8> {
+        let observed = self.input.chart.strip().mesh().observed();
+        let class = |(i, &face): (usize, &u32)| {
+            if face == NO_FACE {
+                COVERAGE_NONE
+            } else if observed[face as usize] && blended.is_none_or(|b| b.support[i] == Support::Observed) {
+                COVERAGE_OBSERVED
+            } else {
+                COVERAGE_FILLED
+            }
+        };
+        surface.faces.iter().enumerate().map(class).collect()
+    }
+
+    fn samples(&self, layer: Layer, surface: &SurfaceTile, blended: Option<&BlendedTile>, coverage: &[u8]) -> Samples {
+        let pixels = surface.rect.len();
+        let on_surface = |i: usize| surface.faces[i] != NO_FACE;
+        let corners = |i: usize| self.input.chart.strip().mesh().faces()[surface.faces[i] as usize];
+        match layer {
+            Layer::Color => {
+                let mut rgba = vec![0u8; pixels * 4];
+                for (i, out) in rgba.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+                    let color = blended.map_or([f32::NAN; 3], |b| b.colors[i]);
+                    if on_surface(i) && !color[0].is_nan() {
+                        let [r, g, b] = color.map(|c| (c / 257.0).round() as u8);
+                        *out = [r, g, b, 255];
+                    }
+                }
+                Samples::U8(rgba)
+            }
+            Layer::Intensity => Samples::U16(
+                (0..pixels)
+                    .map(|i| match blended.map_or(f32::NAN, |b| b.intensities[i]) {
+                        // 0 is NoData, so the darkest value is 1.
+                        value if on_surface(i) && !value.is_nan() => (value.round() as u16).max(1),
+                        _ => 0,
+                    })
+                    .collect(),
+            ),
+            Layer::Labels => {
+                let label = |i: usize| match blended {
+                    Some(b) if !b.labels.is_empty() => b.labels[i],
+                    _ => 0,
+                };
+                match self.label_type() {
+                    SampleType::U8 => {
+                        Samples::U8((0..pixels).map(|i| if on_surface(i) { label(i) as u8 } else { u8::MAX }).collect())
+                    }
+                    SampleType::U16 => Samples::U16(
+                        (0..pixels).map(|i| if on_surface(i) { label(i) as u16 } else { u16::MAX }).collect(),
+                    ),
+                    _ => Samples::U32((0..pixels).map(|i| if on_surface(i) { label(i) } else { u32::MAX }).collect()),
+                }
+            }
+            Layer::Offset => {
+                let offsets = self.input.section_offsets_m;
+                Samples::F32(
+                    (0..pixels)
+                        .map(|i| match offsets {
+                            Some(offsets) if on_surface(i) => {
+                                let w = surface.weights(i);
+                                let value: f64 = corners(i).iter().zip(w).map(|(&v, w)| offsets[v as usize] * w).sum();
+                                ((value / OFFSET_STEP_M).round() * OFFSET_STEP_M) as f32
+                            }
+                            _ => f32::NAN,
+                        })
+                        .collect(),
+                )
+            }
+            Layer::Coverage => Samples::U8(coverage.to_vec()),
+            Layer::Distortion => {
+                let mut bands = vec![f32::NAN; pixels * 4];
+                for (i, out) in bands.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+                    if on_surface(i) {
+                        *out = self.stretch[surface.faces[i] as usize];
+                    }
+                }
+                Samples::F32(bands)
+            }
+            Layer::Relief => Samples::U8(
+                (0..pixels)
+                    .map(|i| {
+                        if !on_surface(i) || self.shade.is_empty() {
+                            return 0;
+                        }
+                        let w = surface.weights(i);
+                        let shade: f64 =
+                            corners(i).iter().zip(w).map(|(&v, w)| f64::from(self.shade[v as usize]) * w).sum();
+                        ((shade * 254.0).round() as u8).saturating_add(1)
+                    })
+                    .collect(),
+            ),
+            Layer::Xyz => {
+                let vertices = self.input.chart.strip().mesh().vertices();
+                let scale = 1.0 / self.input.frame.metres_per_unit;
+                let mut bands = vec![f32::NAN; pixels * 3];
+                for (i, out) in bands.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                    if on_surface(i) {
+                        let w = surface.weights(i);
+                        let [a, b, c] = corners(i).map(|v| vertices[v as usize]);
+                        let position = (a * w[0] + b * w[1] + c * w[2]) * scale;
+                        *out = [position.x as f32, position.y as f32, position.z as f32];
+                    }
+                }
+                Samples::F32(bands)
+            }
+            Layer::SurfacePoint => {
+                let mut bands = vec![-1.0; pixels * 3];
+                for (i, out) in bands.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                    if on_surface(i) {
+                        let [_, b, c] = surface.weights(i);
+                        *out = [f64::from(surface.faces[i]), b, c];
+                    }
+                }
+                Samples::F64(bands)
+            }
+        }
+    }
+
+    fn label_type(&self) -> SampleType {
+        self.layers.iter().find(|d| d.layer == Layer::Labels).map_or(SampleType::U8, |d| d.sample)
+    }
+
+    fn summary(self, counts: &Counts) -> Summary {
+        let pixel_area = self.grid.cell_m() * self.grid.cell_m();
+        let holes: f64 = self.input.chart.strip().hole_loops().iter().map(|l| loop_area(self.input.chart, l)).sum();
+        let inside = (counts.observed + counts.filled) as f64 * pixel_area + holes;
+        let coverage_percent = if inside > 0.0 { 100.0 * counts.observed as f64 * pixel_area / inside } else { 0.0 };
+        Summary {
+            cell_m: self.grid.cell_m(),
+            width_px: self.grid.width(),
+            height_px: self.grid.height(),
+            u_min_m: self.grid.u_min(),
+            v_max_m: self.grid.v_max(),
+            point_spacing_m: self.scatter.as_ref().map(|(s, _)| s.spacing.typical),
+            fill_m: self.scatter.as_ref().map_or([0.0; 2], |(_, reach)| reach.fill_m),
+            max_offset_m: self.max_offset_m,
+            points_used: self.scatter.as_ref().map_or(0, |(s, _)| s.index.len()),
+            points_off_surface: self.points_off_surface,
+            points_unanchored: self.points_unanchored,
+            observed_px: counts.observed,
+            filled_px: counts.filled,
+            empty_px: counts.empty,
+            coverage_percent,
+            layers: self.layers.iter().map(|d| d.layer).collect(),
+            offset_range_m: self.offset_range_m,
+            stretch_range: self.stretch_range,
+            warnings: self.warnings,
+        }
+    }
+}
+
+/// The least rectangle around the chart.
+fn extent(chart: &Chart) -> (Vec2, Vec2) {
+    let start = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+    let mut used = vec![false; chart.uv().len()];
+    chart.strip().mesh().faces().iter().flatten().for_each(|&v| used[v as usize] = true);
+    chart.uv().iter().zip(used).filter(|(_, u)| *u).fold(start, |(low, high), (p, _)| (low.inf(p), high.sup(p)))
+}
+
+/// Area inside a closed line of vertices in the chart, whatever its sense.
+fn loop_area(chart: &Chart, vertices: &[u32]) -> f64 {
+    let uv = chart.uv();
+    let double: f64 = (0..vertices.len())
+        .map(|i| uv[vertices[i] as usize].perp(&uv[vertices[(i + 1) % vertices.len()] as usize]))
+        .sum();
+    double.abs() / 2.0
+}
+
+fn is_on_surface(offset_m: f64, max_offset_m: f64) -> bool {
+    offset_m.abs() <= max_offset_m
+}
+
+fn automatic_max_offset(input: &DrawInput) -> f64 {
+    let Some((_, points)) = input.points else { return OFFSET_LIMIT_BOUNDS_M.1 };
+    let mut sizes: Vec<f64> = points.offsets_m.iter().map(|o| o.abs()).filter(|o| o.is_finite()).collect();
+    let typical = statistics::quantile(&mut sizes, 0.9).unwrap_or(0.0);
+    (OFFSET_LIMIT * typical).clamp(OFFSET_LIMIT_BOUNDS_M.0, OFFSET_LIMIT_BOUNDS_M.1)
+}
+
+/// The layers that can be drawn, sorted, without repetition; what cannot be drawn becomes a warning.
+fn wanted_layers(input: &DrawInput, settings: &Settings, has_points: bool, warnings: &mut Vec<Warning>) -> Vec<Layer> {
+    let mut wanted = settings.layers.clone();
+    wanted.sort_unstable();
+    wanted.dedup();
+    let attributes = input.points.filter(|_| has_points).map(|(cloud, _)| cloud.attributes());
+    let colors = attributes.and_then(|a| a.colors.as_deref());
+    let intensities = attributes.and_then(|a| a.intensities.as_deref());
+    let mut leave_out = |layer: Layer, code: &str, message: &str| {
+        if wanted.contains(&layer) {
+            wanted.retain(|&l| l != layer);
+            warnings.push(Warning::new(code, message));
+        }
+    };
+    let no_color = match colors {
+        None => Some("the scan has no colour, so map/color is not drawn"),
+        Some(c) if c.iter().all(|x| *x == c[0]) => Some("all points have the same colour, so map/color is not drawn"),
+        Some(_) => None,
+    };
+    if let Some(message) = no_color {
+        leave_out(Layer::Color, "no-color", &format!("{message}; intensity and relief show the wall instead"));
+    }
+    let no_intensity = match intensities {
+        None => Some("the scan has no intensity, so map/intensity is not drawn"),
+        Some(i) if i.iter().all(|x| *x == i[0]) => {
+            Some("all points have the same intensity, so map/intensity is not drawn")
+        }
+        Some(_) => None,
+    };
+    if let Some(message) = no_intensity {
+        leave_out(Layer::Intensity, "no-intensity", message);
+    }
+    if input.section_offsets_m.is_none() {
+        let message = "the mean section is not known, so map/offset and map/relief are not drawn";
+        leave_out(Layer::Offset, "no-mean-section", message);
+        leave_out(Layer::Relief, "no-mean-section", message);
+    } else if no_color.is_some() && !wanted.contains(&Layer::Relief) {
+        wanted.push(Layer::Relief);
+    }
+    wanted
+}
+
+/// The stretch at the end of the colours: covers 99 % of the faces, from 1.05 up to 2.
+fn stretch_range(stretch: &[[f32; 4]]) -> f64 {
+    let mut values: Vec<f64> =
+        stretch.iter().filter(|s| s[1] > 0.0).map(|s| f64::from(s[0]).max(1.0 / f64::from(s[1]))).collect();
+    let q = statistics::quantile(&mut values, 0.99).unwrap_or(1.0);
+    1.0 + super::grid::next_in_series((q - 1.0).clamp(0.05, 1.0))
+}
+
+fn describe(layer: Layer, input: &DrawInput, offset_range_m: f64, stretch_range: f64) -> LayerDescription {
+    let attributes = input.points.map(|(cloud, _)| cloud.attributes());
+    let labels = attributes.and_then(|a| a.labels.as_deref()).unwrap_or_default();
+    let of = |sample, bands: &[&'static str], no_data, resampling, look, unit, meaning| LayerDescription {
+        layer,
+        sample,
+        bands: bands.to_vec(),
+        no_data,
+        resampling,
+        look,
+        unit,
+        meaning,
+        band_offsets: vec![],
+    };
+    use {NoData as N, Resampling as R, SampleType as S};
+    match layer {
+        Layer::Color => of(
+            S::U8,
+            &["red", "green", "blue", "alpha"],
+            N::Alpha,
+            R::Mean,
+            Look::Rgba,
+            "",
+            "colour of the scan, mean of the points near each pixel",
+        ),
+        Layer::Intensity => {
+            let (low, high) = intensity_range(attributes.and_then(|a| a.intensities.as_deref()).unwrap_or_default());
+            let look = Look::Grey { low, high };
+            let meaning = "intensity of the scan, mean of the points near each pixel";
+            of(S::U16, &["intensity"], N::Value(0.0), R::Mean, look, "", meaning)
+        }
+        Layer::Labels => {
+            let mut seen: Vec<u32> = labels.to_vec();
+            seen.sort_unstable();
+            seen.dedup();
+            let (sample, none) = match seen.last().copied().unwrap_or(0) {
+                0..255 => (S::U8, f64::from(u8::MAX)),
+                255..65_535 => (S::U16, f64::from(u16::MAX)),
+                _ => (S::U32, f64::from(u32::MAX)),
+            };
+            let meaning = "label of the nearest scan point, 0 = unlabelled; see labels.json";
+            of(sample, &["label"], N::Value(none), R::Nearest, Look::Labels(palette(seen)), "", meaning)
+        }
+        Layer::Offset => {
+            let look = Look::Ramp { ramp: Ramp::Diverging, low: -offset_range_m, high: offset_range_m };
+            let meaning = "distance of the surface from the local mean section, positive into the void";
+            of(S::F32, &["offset"], N::Nan, R::Mean, look, "m", meaning)
+        }
+        Layer::Coverage => {
+            let meaning = "0 no surface, 1 observed, 2 filled (interpolated)";
+            of(S::U8, &["class"], N::Value(0.0), R::Nearest, Look::Coverage, "", meaning)
+        }
+        Layer::Distortion => {
+            let look = Look::Stretch { ramp: Ramp::Heat, high: stretch_range };
+            let meaning = "stretch of the map: s1 >= s2, area ratio, direction of s1 in degrees from the chainage axis";
+            of(S::F32, &["s1", "s2", "area", "angle"], N::Nan, R::Nearest, look, "", meaning)
+        }
+        Layer::Relief => {
+            let look = Look::Grey { low: 1.0, high: 255.0 };
+            let meaning = "shaded relief of the offset from the mean section, lit from the upper left";
+            of(S::U8, &["relief"], N::Value(0.0), R::Mean, look, "", meaning)
+        }
+        Layer::Xyz => {
+            let meaning = "position on the surface in scan coordinates: sample + offset of the band";
+            let mut d = of(S::F32, &["x", "y", "z"], N::Nan, R::Nearest, Look::None, "", meaning);
+            d.band_offsets = input.frame.origin_in_scan.iter().copied().collect();
+            d
+        }
+        Layer::SurfacePoint => {
+            let bands = ["face", "barycentric_b", "barycentric_c"];
+            let meaning = "face of chart.ply and weights of its second and third corner";
+            of(S::F64, &bands, N::Value(-1.0), R::Nearest, Look::None, "", meaning)
+        }
+    }
+}
+
+/// Black and white of the intensity picture: the 1 % and 99 % quantiles of the scan.
+fn intensity_range(intensities: &[u16]) -> (f64, f64) {
+    let step = (intensities.len() / 1_000_000).max(1);
+    let mut some: Vec<f64> = intensities.iter().step_by(step).map(|&i| f64::from(i)).collect();
+    let low = statistics::quantile(&mut some, 0.01).unwrap_or(0.0);
+    let high = statistics::quantile(&mut some, 0.99).unwrap_or(65_535.0);
+    if high > low { (low, high) } else { (0.0, 65_535.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::{Attributes, SourceFile};
+    use crate::map::example::bent_chart;
+    use crate::numeric::Vec3;
+
+    /// Keeps whole layers in memory.
+    #[derive(Default)]
+    pub struct InMemory {
+        pub grid: Option<Grid>,
+        pub descriptions: Vec<LayerDescription>,
+        pub values: Vec<Vec<f64>>,
+    }
+
+    impl Sink for InMemory {
+        fn begin(&mut self, grid: &Grid, layers: &[LayerDescription]) -> Result<(), SinkError> {
+            self.grid = Some(*grid);
+            self.descriptions = layers.to_vec();
+            self.values = layers.iter().map(|l| vec![f64::NAN; grid.rect().len() * l.bands.len()]).collect();
+            Ok(())
+        }
+
+        fn take(&mut self, pieces: Vec<Piece>) -> Result<(), SinkError> {
+            let width = self.grid.unwrap().width();
+            for piece in pieces {
+                for (layer, samples) in piece.layers.iter().enumerate() {
+                    let bands = self.descriptions[layer].bands.len();
+                    for i in 0..piece.rect.len() {
+                        let (x, y) = (piece.rect.column + i % piece.rect.width, piece.rect.row + i / piece.rect.width);
+                        for b in 0..bands {
+                            self.values[layer][(y * width + x) * bands + b] = samples.get(i * bands + b);
+                        }
+                    }
+                }
+            }
+            Ok(())
+        }
+
+        fn finish(&mut self) -> Result<(), SinkError> {
+            Ok(())
+        }
+    }
+
+    fn half_cylinder() -> Chart {
+        let radius = 2.0;
+        bent_chart(12.0, radius * std::f64::consts::PI, 61, 41, |u, v| {
+            let angle = v / radius - std::f64::consts::FRAC_PI_2;
+            Vec3::new(u, -radius * angle.sin(), radius * angle.cos())
+        })
+    }
+
+    fn dense_cloud(chart: &Chart) -> (Cloud, Vec<Vec2>, Vec<f64>) {
+        let (_, high) = extent(chart);
+        let mut uv = Vec::new();
+        for i in 0..600 {
+            for j in 0..300 {
+                uv.push(Vec2::new((f64::from(i) + 0.5) / 600.0 * high.x, (f64::from(j) + 0.5) / 300.0 * high.y));
+            }
+        }
+        let colors = uv.iter().map(|p| [(p.x / high.x * 65_535.0) as u16, (p.y / high.y * 65_535.0) as u16, 0]);
+        let labels = uv.iter().map(|p| u32::from(p.x > 6.0) * 300).collect();
+        let attributes = Attributes { colors: Some(colors.collect()), labels: Some(labels), ..Default::default() };
+        let n = uv.len();
+        let source = SourceFile {
+            path: "x".into(),
+            first_point: 0,
+            point_count: n,
+            record_count: n as u64,
+            dropped_records: vec![],
+        };
+        let cloud = Cloud::new(ScanFrame::local(), vec![Vec3::zeros(); n], attributes, vec![source], vec![]).unwrap();
+        (cloud, uv, vec![0.0; n])
+    }
+
+    #[test]
+    fn all_layers_of_a_half_cylinder() {
+        let chart = half_cylinder();
+        let (cloud, uv, mut offsets_m) = dense_cloud(&chart);
+        offsets_m[0] = 2.0;
+        let section: Vec<f64> = chart.uv().iter().map(|p| 0.01 * p.x).collect();
+        let frame = ScanFrame::with_origin(Vec3::new(500_000.0, 6_000_000.0, 0.0));
+        let input = DrawInput {
+            chart: &chart,
+            points: Some((&cloud, PointsOnMap { uv: &uv, offsets_m: &offsets_m })),
+            frame: &frame,
+            section_offsets_m: Some(&section),
+        };
+        let mut layers = Settings::default().layers;
+        layers.extend([Layer::Relief, Layer::Xyz, Layer::SurfacePoint]);
+        let settings = Settings { cell_m: Some(0.02), layers, ..Default::default() };
+        let mut sink = InMemory::default();
+        let summary = draw(&input, &settings, &mut sink).unwrap();
+        assert_eq!((summary.width_px, summary.height_px), (600, 315));
+        assert_eq!((summary.points_off_surface, summary.points_unanchored), (1, 0));
+        assert!(summary.coverage_percent > 99.9, "{summary:?}");
+        assert_eq!(summary.warnings.len(), 1, "{:?}", summary.warnings);
+        let layer = |wanted: Layer| {
+            let k = sink.descriptions.iter().position(|d| d.layer == wanted).unwrap();
+            (&sink.descriptions[k], &sink.values[k])
+        };
+        let grid = sink.grid.unwrap();
+        for (column, row) in [(0, 10), (300, 150), (599, 300), (77, 310)] {
+            let i = row * 600 + column;
+            let uv = grid.chart_from_pixel(Vec2::new(column as f64 + 0.5, row as f64 + 0.5));
+            // Red grows with chainage, green upwards.
+            let (_, color) = layer(Layer::Color);
+            assert!((color[4 * i] - uv.x / 12.0 * 255.0).abs() < 2.0 && color[4 * i + 3] == 255.0);
+            assert!((color[4 * i + 1] - uv.y / (2.0 * std::f64::consts::PI) * 255.0).abs() < 2.0);
+            let (description, labels) = layer(Layer::Labels);
+            assert_eq!((description.sample, labels[i]), (SampleType::U16, if uv.x > 6.0 { 300.0 } else { 0.0 }));
+            assert!((layer(Layer::Offset).1[i] - 0.01 * uv.x).abs() < OFFSET_STEP_M);
+            assert_eq!(layer(Layer::Coverage).1[i], 1.0);
+            let stretch = &layer(Layer::Distortion).1[4 * i..4 * i + 4];
+            assert!((stretch[0] - 1.0).abs() < 0.01 && (stretch[1] - 1.0).abs() < 0.01);
+            let (description, xyz) = layer(Layer::Xyz);
+            assert_eq!(description.band_offsets, [500_000.0, 6_000_000.0, 0.0]);
+            assert!((xyz[3 * i] - uv.x).abs() < 1e-6);
+            let (_, place) = layer(Layer::SurfacePoint);
+            let corners = chart.corners_in_chart(place[3 * i] as u32);
+            let (b, c) = (place[3 * i + 1], place[3 * i + 2]);
+            assert!((corners[0] * (1.0 - b - c) + corners[1] * b + corners[2] * c - uv).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_mesh_alone_gives_the_geometric_layers() {
+        let chart = half_cylinder();
+        let input = DrawInput { chart: &chart, points: None, frame: &ScanFrame::local(), section_offsets_m: None };
+        let mut sink = InMemory::default();
+        let summary = draw(&input, &Settings::default(), &mut sink).unwrap();
+        assert_eq!(summary.layers, [Layer::Labels, Layer::Coverage, Layer::Distortion]);
+        assert_eq!(summary.warnings.len(), 3);
+    }
+
+    #[test]
+    fn columns_must_fit() {
+        let chart = half_cylinder();
+        let input =
+            DrawInput { chart: &chart, points: None, frame: &ScanFrame::local(), section_offsets_m: Some(&[0.0]) };
+        let error = draw(&input, &Settings::default(), &mut InMemory::default()).unwrap_err();
+        assert!(matches!(error, Error::Length { found: 1, .. }));
+    }
+}
