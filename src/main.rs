@@ -1,2 +1,5 @@
-//! The `adit` program.
-fn main() {}
+//! The `adit` program: everything happens in the library.
+
+fn main() -> std::process::ExitCode {
+    adit::cli::main()
+}

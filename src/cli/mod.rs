@@ -1,1 +1,94 @@
-//! The command line: one file per subcommand.
+//! The command line: one file per subcommand, one line per subcommand in the table below.
+//!
+//! A subcommand is a module with `Arguments` (clap) and `fn run(arguments, &Console) -> Result`. To add one: a `mod` line,
+//! a variant of [`Command`] whose doc comment is its one-line help, and an arm in [`Command::run`].
+
+mod console;
+mod exit;
+mod run;
+
+pub use console::Console;
+pub use exit::{Exit, Failure, Result};
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// The table of subcommands.
+#[derive(Subcommand)]
+enum Command {
+    /// Turn a tunnel scan into a flat, metric map (the whole pipeline).
+    Run(run::Arguments),
+}
+
+impl Command {
+    fn run(self, console: &Console) -> Result {
+        match self {
+            Command::Run(arguments) => run::run(arguments, console),
+        }
+    }
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  adit run --input scan.laz --out runs/today         a map with everything chosen automatically
+  adit run pipelines/quick.toml --out runs/quick     the bundled sample
+  adit help run                                      what a subcommand does, with examples
+
+Exit codes:
+  0 done   1 internal error   2 usage or pipeline file   3 bad input   4 unsupported input
+  5 finished, but a quality limit was broken   6 not enough memory or disk   7 cancelled";
+
+/// Turns laser scans of tunnels into flat, metric maps, and what is drawn on the maps back into the scans.
+#[derive(Parser)]
+#[command(name = "adit", version, after_help = EXAMPLES, max_term_width = 110, arg_required_else_help = true)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    console: console::Options,
+    /// Worker threads (default: one per core). Never changes a result.
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+}
+
+/// The command line of this process: parses the arguments, runs the subcommand, tells the exit code.
+pub fn main() -> ExitCode {
+    exit::report_panics_as_internal_errors();
+    let line = match CommandLine::try_parse() {
+        Ok(line) => line,
+        Err(error) => {
+            // Help and version are no errors. A closed pipe while printing is none either.
+            let code = if error.use_stderr() { Exit::Usage } else { Exit::Done };
+            let _ = error.print();
+            return code.into();
+        }
+    };
+    let console = Console::new(&line.console);
+    if let Some(threads) = line.threads {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
+        if let Err(error) = pool {
+            console.error(&format!("cannot start {threads} threads: {error}"));
+            return Exit::Resources.into();
+        }
+    }
+    match std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| line.command.run(&console))) {
+        Ok(Ok(exit)) => exit.into(),
+        Ok(Err(failure)) => {
+            console.failure(&failure);
+            failure.exit.into()
+        }
+        // The hook has already told what happened.
+        Err(_) => Exit::Internal.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        CommandLine::command().debug_assert();
+    }
+}
