@@ -1,8 +1,13 @@
 //! Triangle meshes: plain indexed arrays plus derived topology.
 
+pub mod reconstruct;
+pub mod repair;
+pub mod section;
+mod section_grid;
 pub mod surface_point;
 pub mod topology;
 
+pub use reconstruct::{Settings, Summary, reconstruct};
 pub use surface_point::SurfacePoint;
 
 use crate::numeric::Vec3;
