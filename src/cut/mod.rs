@@ -1,5 +1,9 @@
 //! Cutting the tube open: from a [`Mesh`] to a [`Strip`] of disk topology.
 
+mod seam;
+
+pub use seam::{Settings, Summary, open};
+
 use crate::mesh::{Mesh, topology};
 
 /// A mesh of genus 0 with one component and one outer boundary loop, possibly with hole loops inside.
@@ -39,6 +43,28 @@ pub enum Error {
         loops: usize,
         /// Vertices - edges + faces.
         euler: i64,
+    },
+    /// The mesh is no tube around the axis: a tube has two borders (or one and a closed end) that run around it once.
+    #[error(
+        "the mesh is no tube around the axis: its borders wind {turns:?} times around it, where one or two should once; check the axis and side branches"
+    )]
+    Portals {
+        /// Turns of each border that winds around the axis at all.
+        turns: Vec<i64>,
+    },
+    /// A border still winds around the axis after the cut.
+    #[error("the border at vertex {vertex} still winds {turns} times around the axis after the cut")]
+    NotOpened {
+        /// A vertex of the border.
+        vertex: u32,
+        /// Its turns.
+        turns: i64,
+    },
+    /// The seam angle is not a number.
+    #[error("cut setting 'seam_angle_deg' is {value}, but must be an angle in degrees")]
+    Setting {
+        /// The value given.
+        value: f64,
     },
 }
 

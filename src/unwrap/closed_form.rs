@@ -13,8 +13,6 @@ pub struct Known {
     pub axis: Axis,
     /// The exact flat form; for surfaces that cannot be flattened exactly, the ideal (chainage, girth).
     pub flat: Vec<Vec2>,
-    /// Whether `flat` is an isometry of the *mesh*, not only of the smooth surface.
-    pub developable: bool,
 }
 
 /// A uniform pseudo-random number in [-0.5, 0.5) from two indices (SplitMix64).
@@ -88,7 +86,7 @@ pub fn prism() -> Known {
     let flat = (0..mesh.vertices().len())
         .map(|v| Vec2::new(mesh.vertices()[v].x, path[v % (columns as usize + 1)].1 - crown))
         .collect();
-    Known { name: "prism", strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(12.0), flat, developable: true }
+    Known { name: "prism", strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(12.0), flat }
 }
 
 /// A half cylinder of radius 4 m as a regular polygon: the case libigl's two-pin LSCM fails on.
@@ -114,7 +112,7 @@ fn cylinder(name: &'static str, half_angle: f64) -> Known {
             Vec2::new(mesh.vertices()[v as usize].x, column * chord)
         })
         .collect();
-    Known { name, strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(9.0), flat, developable: true }
+    Known { name, strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(9.0), flat }
 }
 
 /// A cone around the axis, radius 3 m to 4 m over 10 m, cut open along the invert; `flat` is (chainage, girth).
@@ -134,7 +132,7 @@ pub fn cone() -> Known {
             p.y = -p.y.abs();
         }
     }
-    Known { name: "cone", strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(10.0), flat, developable: false }
+    Known { name: "cone", strip: Strip::from_disk(mesh).unwrap(), axis: straight_axis(10.0), flat }
 }
 
 /// A circular tunnel of radius 3 m on a left-hand bend of `bend` metres, a quarter turn; `flat` is (chainage, girth).
@@ -156,7 +154,7 @@ pub fn bend(bend: f64) -> Known {
             Vec2::new(i / 60.0 * length, (j - 30.0) * 6.0 * (PI / 60.0).sin())
         })
         .collect();
-    Known { name: "bend", strip: Strip::from_disk(mesh).unwrap(), axis, flat, developable: false }
+    Known { name: "bend", strip: Strip::from_disk(mesh).unwrap(), axis, flat }
 }
 
 /// A rough tunnel of radius 3.5 m on a gentle bend: waves of several lengths and random displacement of every vertex.
@@ -181,7 +179,7 @@ pub fn rough(rows: u32, columns: u32) -> Known {
         Vec2::new(c.chainage, c.angle() * 3.5)
     });
     let flat = flat.collect();
-    Known { name: "rough", strip: Strip::from_disk(mesh).unwrap(), axis, flat, developable: false }
+    Known { name: "rough", strip: Strip::from_disk(mesh).unwrap(), axis, flat }
 }
 
 /// The surfaces that flatten without any distortion.
