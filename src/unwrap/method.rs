@@ -141,4 +141,6 @@ impl JsonSchema for Method {
 methods! {
     /// Chainage and true girth of the section; no optimisation.
     Section(section) = "section", Placed;
+    /// Least squares conformal map: keeps angles.
+    Lscm(lscm) = "lscm", Similar;
 }

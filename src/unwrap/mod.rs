@@ -3,12 +3,16 @@
 //! The map is seen from inside: u runs with the chainage, v is the girth from the crown, positive over the right wall
 //! (right when facing increasing chainage). Faces that run counter-clockwise seen from inside keep that sense in (u, v).
 
+mod conformal;
 pub mod distortion;
 pub mod guide;
+pub mod lscm;
 pub mod method;
 pub mod readability;
 pub mod registration;
+mod rigid_fit;
 pub mod section;
+mod triangle_shapes;
 pub mod unfold;
 #[cfg(test)]
 pub(crate) mod closed_form;
