@@ -2,7 +2,16 @@
 //!
 //! Everything that Adit knows about "along the tunnel" and "around the tunnel" is said in [`AxisCoordinates`].
 
+mod alignment;
+mod enclosed_void;
+mod sections;
+mod skeleton;
+mod smoothing;
 mod spline;
+mod trace;
+
+pub use alignment::import_csv;
+pub use trace::{Branch, Direction, Settings, Side, Source, Summary, trace};
 
 use crate::numeric::{Vec3, any_perpendicular};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
@@ -58,10 +67,50 @@ impl AxisCoordinates {
     }
 }
 
-/// Why points do not make an axis.
+/// Why points or a file do not make an axis.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[non_exhaustive]
 pub enum Error {
+    /// The points do not enclose an elongated space.
+    #[error(
+        "the scan is no tunnel: {reason} (surface that faces an enclosed space: {:.0} %, its length: {length_m:.1} m, \
+         its width: {width_m:.1} m); if it is one, give its centre line as axis.alignment", enclosed_share * 100.0
+    )]
+    NotATunnel {
+        /// What is missing.
+        reason: &'static str,
+        /// Share (0 to 1) of the scanned surface that borders on the largest enclosed space.
+        enclosed_share: f64,
+        /// Length of that space, metres.
+        length_m: f64,
+        /// Its width (twice the clearance), metres.
+        width_m: f64,
+    },
+    /// The tunnel runs in a circle, or there are several ways from one end to the other.
+    #[error(
+        "the scan has a closed loop: two ways that stay apart for at least {arm_m:.1} m; give axis.ends to follow one \
+         tunnel, or cut the scan into single tunnels"
+    )]
+    ClosedLoop {
+        /// Length of the shorter way, metres.
+        arm_m: f64,
+    },
+    /// The alignment file has a line that is no point.
+    #[error("line {line} of the alignment is not understood: {problem}")]
+    Alignment {
+        /// Line number from 1.
+        line: usize,
+        /// What was expected and found.
+        problem: String,
+    },
+    /// A setting is out of its range.
+    #[error("axis.{key} is out of range: {problem}")]
+    Setting {
+        /// The key in the pipeline file.
+        key: &'static str,
+        /// What was given and what is possible.
+        problem: String,
+    },
     /// Fewer than two distinct points.
     #[error("an axis needs at least 2 distinct points, got {found}")]
     TooFewPoints {
@@ -117,7 +166,7 @@ impl Axis {
         let limit = SHAFT_INCLINATION_DEG.to_radians().sin();
         let forwards: Vec<Vec3> = axis.seed_lengths.iter().map(|&s| axis.spline.at_length(s).tangent()).collect();
         if forwards.iter().any(|f| f.z.abs() > limit) {
-            axis.transported_left = transport_left(&forwards);
+            axis.transported_left = transport_left(&forwards, &Vec3::y());
         }
         Ok(axis)
     }
@@ -146,6 +195,17 @@ impl Axis {
     pub fn reversed(&self, start_chainage: f64) -> Self {
         let points: Vec<Vec3> = self.spline.knots().iter().rev().copied().collect();
         Self::through(&points, start_chainage).expect("the knots of an axis make an axis")
+    }
+
+    /// The same shaft with its crown line at its start facing the azimuth (degrees clockwise from north) instead of
+    /// north. An axis with a gravity frame is returned unchanged.
+    pub fn with_crown_azimuth(mut self, azimuth_deg: f64) -> Self {
+        if self.is_shaft() {
+            let forwards: Vec<Vec3> = self.seed_lengths.iter().map(|&s| self.spline.at_length(s).tangent()).collect();
+            let (sin, cos) = azimuth_deg.to_radians().sin_cos();
+            self.transported_left = transport_left(&forwards, &Vec3::new(sin, cos, 0.0));
+        }
+        self
     }
 
     /// The frame at a chainage; beyond the ends the axis continues straight.
@@ -216,15 +276,14 @@ impl Axis {
     }
 }
 
-/// Rotation-minimizing `left` vectors along unit tangents, starting so that `up` is as close to north (+y) as possible:
-/// in a vertical shaft the crown line then faces north.
+/// Rotation-minimizing `left` vectors along unit tangents, starting so that `up` is as close to `crown` as possible.
 ///
 /// Reference: W. Wang, B. Juettler, D. Zheng, Y. Liu, "Computation of rotation minimizing frames", ACM TOG 27(1), 2008,
 /// doi:10.1145/1330511.1330513 (here with the rotation that takes one tangent to the next, exact for our dense samples).
-fn transport_left(forwards: &[Vec3]) -> Vec<Vec3> {
+fn transport_left(forwards: &[Vec3], crown: &Vec3) -> Vec<Vec3> {
     let first = forwards[0];
-    let north_left = Vec3::y().cross(&first);
-    let mut left = if north_left.norm() > 0.1 { north_left.normalize() } else { any_perpendicular(&first) };
+    let crown_left = crown.cross(&first);
+    let mut left = if crown_left.norm() > 0.1 { crown_left.normalize() } else { any_perpendicular(&first) };
     let mut lefts = vec![left];
     for pair in forwards.windows(2) {
         if let Some(turn) = nalgebra::UnitQuaternion::rotation_between(&pair[0], &pair[1]) {

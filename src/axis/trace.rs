@@ -1,0 +1,553 @@
+//! Finds the axis of a scanned tunnel without any parameter.
+//!
+//! Steps: the space that the scan encloses on a coarse grid (`enclosed_void`); the way through it between its two
+//! farthest ends (`skeleton`); slices perpendicular to that way, shifted onto their mean section and smoothed, again
+//! and again (`sections`, `smoothing`); the ends where the section stops being covered; the direction of chainage.
+//! Works for straight, curved, inclined, helical and vertical tunnels; a scan that encloses no elongated space is
+//! refused with numbers. Guarantees: the same axis for any number of threads.
+
+use super::enclosed_void::{EnclosedVoid, State, edge_for, enclosed_void};
+use super::sections::{DIRECTIONS, Refined, direction_of, refine, slice};
+use super::skeleton::{Skeleton, skeleton};
+use super::{Axis, AxisCoordinates, Error};
+use crate::clean::Spacing;
+use crate::cloud::ScanFrame;
+use crate::numeric::Vec3;
+use crate::numeric::statistics::median;
+use crate::warning::Warning;
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// Points used; more would only cost time.
+const MOST_POINTS: usize = 200_000;
+/// Cells with points on the coarse grid.
+const SURFACE_CELLS: usize = 16_000;
+/// The grid is refined until the void is this many cells wide (half width), if the points allow.
+const CLEARANCE_CELLS: f64 = 4.5;
+/// Share of directions that meet surface: inside a tunnel, and inside one that lacks its floor or roof.
+const ENCLOSED: f64 = 0.76;
+const HALF_OPEN: f64 = 0.62;
+/// Share of the surface that must border on the enclosed space: for a tunnel, and for a half-open one.
+const LEAST_SHARE: f64 = 0.25;
+const LEAST_SHARE_HALF_OPEN: f64 = 0.6;
+/// Length over width that is at least needed: for a tunnel, and for a half-open one.
+const LEAST_ASPECT: f64 = 0.5;
+const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
+/// The tunnel ends where less than this share of the usual directions is covered.
+const PORTAL_COVERAGE: f64 = 0.6;
+/// Steeper than this from end to end, chainage runs downwards.
+const DOWNWARDS_DEG: f64 = 60.0;
+/// More points outside the axis' range than this is worth a warning, percent.
+const MANY_OUTSIDE_PERCENT: f64 = 10.0;
+
+/// How the axis is found.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// A CSV file with the centre line (`x,y,z` or `chainage,x,y,z` in scan coordinates). The axis is traced when not
+    /// given.
+    pub alignment: Option<PathBuf>,
+    /// Chainage of the axis' first point in metres. 0, or the alignment's own chainage, when not given.
+    pub start_chainage_m: Option<f64>,
+    /// Which way chainage increases.
+    pub direction: Direction,
+    /// Chainage increases towards this azimuth, degrees clockwise from north. Overrides `direction`.
+    pub direction_azimuth_deg: Option<f64>,
+    /// In a shaft, the azimuth that its crown line faces, degrees clockwise from north. North when not given.
+    pub crown_azimuth_deg: Option<f64>,
+    /// Two points `[[x, y, z], [x, y, z]]` in scan coordinates between which to follow a network. The two farthest
+    /// ends when not given.
+    pub ends: Option<[[f64; 3]; 2]>,
+}
+
+/// Which way chainage increases.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Direction {
+    /// Towards the positive side of x or y, whichever the axis spans more; downwards in shafts; as in the alignment
+    /// file if there is one.
+    #[default]
+    Auto,
+    /// The opposite of `auto`.
+    Reverse,
+}
+
+impl Settings {
+    /// The settings with `ends` in local metres, as [`trace`] wants them.
+    pub fn in_local(&self, frame: &ScanFrame) -> Self {
+        let ends = self.ends.map(|e| e.map(|p| frame.local_from_scan(&p.into()).into()));
+        Self { ends, ..self.clone() }
+    }
+
+    pub(super) fn check(&self) -> Result<(), Error> {
+        let finite = |key, value: Option<f64>| match value {
+            Some(v) if !v.is_finite() => Err(Error::Setting { key, problem: format!("{v} is not a finite number") }),
+            _ => Ok(()),
+        };
+        finite("start_chainage_m", self.start_chainage_m)?;
+        finite("direction_azimuth_deg", self.direction_azimuth_deg)?;
+        finite("crown_azimuth_deg", self.crown_azimuth_deg)?;
+        if let Some(ends) = self.ends {
+            ends.iter().flatten().try_for_each(|v| finite("ends", Some(*v)))?;
+            if ends[0] == ends[1] {
+                return Err(Error::Setting { key: "ends", problem: "the two points are the same".to_owned() });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where an axis came from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Source {
+    /// Traced through the scan.
+    Traced,
+    /// Read from an alignment file.
+    Alignment,
+}
+
+/// On which side of the main tunnel something lies, facing increasing chainage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Side {
+    /// Left wall.
+    Left,
+    /// Right wall.
+    Right,
+    /// Crown.
+    Above,
+    /// Invert.
+    Below,
+}
+
+/// A side drift.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Branch {
+    /// Chainage of its mouth, metres.
+    pub chainage_m: f64,
+    /// The side on which it leaves.
+    pub side: Side,
+    /// Its scanned length, metres.
+    pub length_m: f64,
+    /// A point in its middle, local metres: an end for `axis.ends` of its own run.
+    pub middle_in_local: [f64; 3],
+}
+
+/// How the axis was found and what it is like.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Traced or imported.
+    pub source: Source,
+    /// Length of the axis, metres.
+    pub length_m: f64,
+    /// First chainage, metres.
+    pub start_chainage_m: f64,
+    /// Last chainage, metres.
+    pub end_chainage_m: f64,
+    /// Azimuth at the start and at the end, degrees.
+    pub azimuth_deg: [f64; 2],
+    /// Least and greatest gradient, percent; null where vertical.
+    pub gradient_percent: [Option<f64>; 2],
+    /// Least radius of curvature, metres; null when straight (above 100 km).
+    pub least_bend_radius_m: Option<f64>,
+    /// Whether the frame is carried along because gravity cannot define it.
+    pub shaft: bool,
+    /// Radius of the circle with the area of the mean section, metres.
+    pub section_radius_m: Option<f64>,
+    /// Share of the surface that borders on the enclosed space, 0 to 1.
+    pub enclosed_share: Option<f64>,
+    /// Cell of the coarse grid, metres.
+    pub coarse_cell_m: Option<f64>,
+    /// Median share of directions around the axis in which there is surface, 0 to 1.
+    pub coverage: Option<f64>,
+    /// Movements of the section's centre along less than this are relief, not axis; metres.
+    pub smoothing_wavelength_m: Option<f64>,
+    /// Median distance between the axis and the centres of single slices, metres.
+    pub centre_residual_m: Option<f64>,
+    /// Whether the start and the end are portals (else the scan just ends, or the tunnel has a face).
+    pub ends_at_portal: Option<[bool; 2]>,
+    /// Share of the points before the start and after the end, percent.
+    pub outside_percent: [f64; 2],
+    /// Side drifts, by chainage.
+    pub branches: Vec<Branch>,
+    /// What a person should know.
+    pub warnings: Vec<Warning>,
+}
+
+/// Traces the axis of the tunnel that `points` (local metres, one per voxel or otherwise evened out) were scanned in.
+///
+/// # Errors
+/// [`Error::NotATunnel`] with what was seen, [`Error::ClosedLoop`], [`Error::Setting`].
+pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Error> {
+    settings.check()?;
+    if let Some(index) = points.iter().position(|p| !p.iter().all(|c| c.is_finite())) {
+        return Err(Error::NotFinite { index });
+    }
+    let sample: Vec<Vec3> = points.iter().step_by(points.len().div_ceil(MOST_POINTS).max(1)).copied().collect();
+    if sample.len() < 200 {
+        return Err(not_a_tunnel("there are too few points", None, 0.0));
+    }
+    let spacing = Spacing::estimate(&sample);
+    let mut warnings = Vec::new();
+    let void = find_void(&sample, &spacing, &mut warnings)?;
+    let skeleton = skeleton(&void, settings.ends.map(|e| e.map(Vec3::from)));
+    if let (Some(arm_m), None) = (skeleton.loop_arm_m, settings.ends) {
+        return Err(Error::ClosedLoop { arm_m });
+    }
+    let rough = rough_axis(&skeleton, &void)?;
+    let volume = skeleton.main_cells.len() as f64 * void.grid.cell_m.powi(3);
+    let radius_m = (volume / rough.length().max(void.clearance_m) / std::f64::consts::PI).sqrt().max(void.clearance_m);
+    let surface = surface_of(&sample, &void, &skeleton, &rough, radius_m);
+    let least_step_m = (1.3 * spacing.across_m).max(3.0 * spacing.along_m);
+    let refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
+    let (range, coverage) = covered_range(&surface, &refined, least_step_m)
+        .ok_or_else(|| not_a_tunnel("no section is covered well enough", Some(&void), rough.length()))?;
+    let knots = knots_between(&refined.axis, range, refined.radius_m);
+    let start_chainage = settings.start_chainage_m.unwrap_or(0.0);
+    let forwards = Axis::through(&knots, start_chainage)?;
+    let flipped = is_against_direction(&forwards, settings);
+    let axis = finish(if flipped { forwards.reversed(start_chainage) } else { forwards }, settings, &mut warnings);
+
+    let mut ends_at_portal = skeleton.ends_at_portal;
+    if flipped {
+        ends_at_portal.reverse();
+    }
+    let outside_percent = outside_percent(&sample, &axis);
+    if outside_percent[0] + outside_percent[1] > MANY_OUTSIDE_PERCENT {
+        warnings.push(Warning::new(
+            "points-beyond-portals",
+            format!(
+                "{:.1} % of the points lie before the start and {:.1} % after the end of the enclosed tunnel; they are \
+                 not mapped",
+                outside_percent[0], outside_percent[1]
+            ),
+        ));
+    }
+    let branches = branches(&skeleton, &axis);
+    if !branches.is_empty() {
+        let list: Vec<String> = branches
+            .iter()
+            .map(|b| format!("{:?} at {:.1} m, {:.0} m long", b.side, b.chainage_m, b.length_m).to_lowercase())
+            .collect();
+        warnings.push(Warning::new(
+            "branches",
+            format!(
+                "the tunnel has {} side drift(s) that are not followed: {}; give axis.ends to follow one",
+                branches.len(),
+                list.join("; ")
+            ),
+        ));
+    }
+    if skeleton.pillars > 0 {
+        warnings.push(Warning::new(
+            "obstacles",
+            format!("the void splits around {} pillar(s) or other obstacles; the axis passes them", skeleton.pillars),
+        ));
+    }
+    let mut summary = describe(&axis, Source::Traced, warnings);
+    summary.section_radius_m = Some(refined.radius_m);
+    summary.enclosed_share = Some(void.enclosed_share);
+    summary.coarse_cell_m = Some(void.grid.cell_m);
+    summary.coverage = Some(coverage);
+    summary.smoothing_wavelength_m = Some(refined.wavelength_m);
+    summary.centre_residual_m = Some(refined.residual_m);
+    summary.ends_at_portal = Some(ends_at_portal);
+    summary.outside_percent = outside_percent;
+    summary.branches = branches;
+    Ok((axis, summary))
+}
+
+fn not_a_tunnel(reason: &'static str, void: Option<&EnclosedVoid>, length_m: f64) -> Error {
+    Error::NotATunnel {
+        reason,
+        enclosed_share: void.map_or(0.0, |v| v.enclosed_share),
+        length_m,
+        width_m: void.map_or(0.0, |v| 2.0 * v.clearance_m),
+    }
+}
+
+/// The enclosed void on a grid fine enough to see it and coarse enough that walls have no gaps.
+fn find_void(points: &[Vec3], spacing: &Spacing, warnings: &mut Vec<Warning>) -> Result<EnclosedVoid, Error> {
+    let finest = (2.5 * spacing.along_m).max(1.15 * spacing.across_m);
+    let coarsest = edge_for(points, SURFACE_CELLS).max(finest);
+    let search = |share: f64, least_share: f64| {
+        let mut cell_m = coarsest;
+        let mut best: Option<EnclosedVoid> = None;
+        loop {
+            let found = enclosed_void(points, cell_m, share);
+            let wide_enough = found.as_ref().is_some_and(|v| v.clearance_m >= CLEARANCE_CELLS * cell_m);
+            if let Some(void) = found
+                && best.as_ref().is_none_or(|b| void.enclosed_share > 0.8 * b.enclosed_share)
+            {
+                best = Some(void);
+            }
+            let good = best.as_ref().is_some_and(|b| b.enclosed_share >= least_share);
+            if (wide_enough && good) || cell_m <= finest || cell_m < 0.1 * coarsest {
+                return best;
+            }
+            cell_m = (0.6 * cell_m).max(finest);
+        }
+    };
+    let closed = search(ENCLOSED, LEAST_SHARE);
+    if let Some(void) = closed.as_ref().filter(|v| v.enclosed_share >= LEAST_SHARE) {
+        let length_m = length_of(void);
+        if length_m >= LEAST_ASPECT * 2.0 * void.clearance_m && void.clearance_m >= 2.0 * void.grid.cell_m {
+            return Ok(closed.expect("just looked at"));
+        }
+    }
+    let open = search(HALF_OPEN, LEAST_SHARE_HALF_OPEN);
+    if let Some(void) = open.as_ref().filter(|v| v.enclosed_share >= LEAST_SHARE_HALF_OPEN) {
+        let length_m = length_of(void);
+        if length_m >= LEAST_ASPECT_HALF_OPEN * 2.0 * void.clearance_m && void.clearance_m >= 2.0 * void.grid.cell_m {
+            warnings.push(Warning::new(
+                "half-open-section",
+                "the section is open on one side (a trench, or a floor or roof that was not scanned); the axis follows \
+                 what is there",
+            ));
+            return Ok(open.expect("just looked at"));
+        }
+        return Err(not_a_tunnel("the enclosed space is not elongated", Some(void), length_m));
+    }
+    match closed.or(open) {
+        Some(void) => {
+            let length_m = length_of(&void);
+            let reason = if void.enclosed_share < LEAST_SHARE {
+                "too little of the surface faces an enclosed space"
+            } else {
+                "the enclosed space is not elongated"
+            };
+            Err(not_a_tunnel(reason, Some(&void), length_m))
+        }
+        None => Err(not_a_tunnel("the surface encloses no space", None, 0.0)),
+    }
+}
+
+/// Largest extent of a void's cells, metres: enough for judging whether it is elongated.
+fn length_of(void: &EnclosedVoid) -> f64 {
+    let centres: Vec<Vec3> = void.cells.iter().map(|&c| void.grid.centre(c)).collect();
+    crate::spatial::voxel_grid::bounds(&centres).map_or(0.0, |(low, high)| (high - low).norm())
+}
+
+/// A curve through the skeleton's path, freed of the steps of the grid.
+fn rough_axis(skeleton: &Skeleton, void: &EnclosedVoid) -> Result<Axis, Error> {
+    let mut path = skeleton.path.clone();
+    for _ in 0..4 {
+        let before = path.clone();
+        for i in 1..path.len().saturating_sub(1) {
+            path[i] = (before[i - 1] + before[i] * 2.0 + before[i + 1]) / 4.0;
+        }
+    }
+    let mut knots: Vec<Vec3> = Vec::new();
+    for p in &path {
+        if knots.last().is_none_or(|last| (p - last).norm() >= 0.7 * void.clearance_m) {
+            knots.push(*p);
+        }
+    }
+    if knots.len() < 2 {
+        knots = vec![path[0], path[path.len() - 1]];
+    }
+    if (knots[knots.len() - 1] - knots[0]).norm() < 0.5 * void.grid.cell_m {
+        return Err(not_a_tunnel("the enclosed space is not elongated", Some(void), length_of(void)));
+    }
+    Axis::through(&knots, 0.0)
+}
+
+/// Points on the surface of the main void, and those that continue it beyond its ends.
+fn surface_of(points: &[Vec3], void: &EnclosedVoid, skeleton: &Skeleton, rough: &Axis, radius_m: f64) -> Vec<Vec3> {
+    let grid = &void.grid;
+    let occupied_around = |cells: &[usize]| {
+        let mut around: Vec<usize> = cells
+            .iter()
+            .flat_map(|&c| grid.neighbours(c, 26).map(|(n, _)| n))
+            .filter(|&n| grid.state(n) == State::Occupied)
+            .collect();
+        around.sort_unstable();
+        around.dedup();
+        around
+    };
+    let touching = occupied_around(&skeleton.main_cells);
+    let mut walls = occupied_around(&touching);
+    walls.extend(&touching);
+    walls.sort_unstable();
+    walls.dedup();
+    let keep: Vec<bool> = points
+        .par_iter()
+        .with_min_len(1024)
+        .map(|p| {
+            if grid.cell_at(p).is_some_and(|c| walls.binary_search(&c).is_ok()) {
+                return true;
+            }
+            let c = rough.project(p);
+            let beyond = (rough.start_chainage() - c.chainage).max(c.chainage - rough.end_chainage());
+            beyond > -radius_m && beyond < 2.0 * radius_m && c.radius() < 1.6 * radius_m
+        })
+        .collect();
+    points.iter().zip(keep).filter(|(_, k)| *k).map(|(p, _)| *p).collect()
+}
+
+/// First and last chainage at which enough of the section is covered, and the usual coverage.
+fn covered_range(surface: &[Vec3], refined: &Refined, least_step_m: f64) -> Option<((f64, f64), f64)> {
+    let axis = &refined.axis;
+    let span = (axis.start_chainage(), axis.end_chainage());
+    let step_m = (0.1 * refined.radius_m).max(least_step_m).max((span.1 - span.0) / 8000.0);
+    let slices = slice(surface, axis, step_m, refined.radius_m, span);
+    let coverage: Vec<f64> = (0..slices.radii.len()).map(|i| slices.coverage(i)).collect();
+    let mut seen: Vec<f64> = coverage.iter().copied().filter(|c| *c > 0.1).collect();
+    let usual = median(&mut seen)?;
+    let limit = PORTAL_COVERAGE * usual;
+    let first = coverage.iter().position(|c| *c >= limit)?;
+    let last = coverage.iter().rposition(|c| *c >= limit)?;
+    // Within the outermost slices: where the wall begins in each direction.
+    let needed = ((limit * DIRECTIONS as f64).ceil() as usize).max(1);
+    let slice_start = |i: usize| slices.start + i as f64 * slices.step_m;
+    let extreme = |from: f64, to: f64, sign: f64| -> f64 {
+        let mut nearest = [f64::INFINITY; DIRECTIONS];
+        for p in surface {
+            let c: AxisCoordinates = axis.project(p);
+            if c.chainage >= from && c.chainage <= to {
+                let mean = slices.mean_radius(&c);
+                if (c.radius() - mean).abs() < 0.35 * mean {
+                    let a = direction_of(&c);
+                    nearest[a] = nearest[a].min(sign * c.chainage);
+                }
+            }
+        }
+        let mut begun: Vec<f64> = nearest.iter().copied().filter(|n| n.is_finite()).collect();
+        begun.sort_unstable_by(f64::total_cmp);
+        sign * begun[(needed - 1).min(begun.len() - 1)]
+    };
+    let start = extreme(slice_start(first), slice_start(first + 1), 1.0);
+    let end = extreme(slice_start(last), slice_start(last + 1), -1.0);
+    (end > start).then_some(((start, end), usual))
+}
+
+fn knots_between(axis: &Axis, (start, end): (f64, f64), radius_m: f64) -> Vec<Vec3> {
+    let count = (((end - start) / radius_m).round() as usize).max(1);
+    (0..=count).map(|i| axis.frame_at(start + (end - start) * i as f64 / count as f64).origin).collect()
+}
+
+/// Whether chainage has to run the other way to follow the settings or the rule.
+fn is_against_direction(axis: &Axis, settings: &Settings) -> bool {
+    let (start, end) = (axis.frame_at(axis.start_chainage()).origin, axis.frame_at(axis.end_chainage()).origin);
+    let chord = end - start;
+    if let Some(azimuth) = settings.direction_azimuth_deg {
+        let (sin, cos) = azimuth.to_radians().sin_cos();
+        return chord.x * sin + chord.y * cos < 0.0;
+    }
+    let against = if chord.z.abs() > chord.norm() * DOWNWARDS_DEG.to_radians().sin() {
+        chord.z > 0.0
+    } else {
+        let steps = (axis.length().ceil() as usize).clamp(2, 10_000);
+        let points: Vec<Vec3> = (0..=steps)
+            .map(|i| axis.frame_at(axis.start_chainage() + axis.length() * i as f64 / steps as f64).origin)
+            .collect();
+        let (low, high) = crate::spatial::voxel_grid::bounds(&points).expect("an axis has points");
+        if high.x - low.x > high.y - low.y { chord.x < 0.0 } else { chord.y < 0.0 }
+    };
+    against != (settings.direction == Direction::Reverse)
+}
+
+/// Applies what the settings say about the frame.
+pub(super) fn finish(axis: Axis, settings: &Settings, warnings: &mut Vec<Warning>) -> Axis {
+    match settings.crown_azimuth_deg {
+        Some(azimuth) if axis.is_shaft() => axis.with_crown_azimuth(azimuth),
+        Some(azimuth) => {
+            warnings.push(Warning::new(
+                "crown-azimuth-unused",
+                format!(
+                    "axis.crown_azimuth_deg = {azimuth} was ignored: the axis is no shaft, gravity defines its crown"
+                ),
+            ));
+            axis
+        }
+        None => axis,
+    }
+}
+
+/// The direction of an imported axis.
+pub(super) fn imported_direction(axis: Axis, settings: &Settings) -> Axis {
+    let turn = match settings.direction_azimuth_deg {
+        Some(_) => is_against_direction(&axis, settings),
+        None => settings.direction == Direction::Reverse,
+    };
+    let start = axis.start_chainage();
+    if turn { axis.reversed(start) } else { axis }
+}
+
+fn outside_percent(points: &[Vec3], axis: &Axis) -> [f64; 2] {
+    let chainages: Vec<f64> = points.par_iter().with_min_len(1024).map(|p| axis.project(p).chainage).collect();
+    let share = |count: usize| 100.0 * count as f64 / points.len() as f64;
+    // A millimetre of grace: the outermost points define the ends.
+    [
+        share(chainages.iter().filter(|c| **c < axis.start_chainage() - 1e-3).count()),
+        share(chainages.iter().filter(|c| **c > axis.end_chainage() + 1e-3).count()),
+    ]
+}
+
+fn branches(skeleton: &Skeleton, axis: &Axis) -> Vec<Branch> {
+    let mut found: Vec<Branch> = skeleton
+        .branches
+        .iter()
+        .filter_map(|rough| {
+            let mouth = axis.project(&rough.mouth);
+            // What leaves beyond the ends is the outside of a portal.
+            if mouth.chainage <= axis.start_chainage() || mouth.chainage >= axis.end_chainage() {
+                return None;
+            }
+            let frame = axis.frame_at(mouth.chainage);
+            let towards = rough.middle - frame.origin;
+            let (right, up) = (-towards.dot(&frame.left), towards.dot(&frame.up));
+            let side = if up.abs() > right.abs() {
+                if up > 0.0 { Side::Above } else { Side::Below }
+            } else if right > 0.0 {
+                Side::Right
+            } else {
+                Side::Left
+            };
+            Some(Branch {
+                chainage_m: mouth.chainage,
+                side,
+                length_m: rough.length_m,
+                middle_in_local: rough.middle.into(),
+            })
+        })
+        .collect();
+    found.sort_by(|a, b| a.chainage_m.total_cmp(&b.chainage_m));
+    found
+}
+
+/// What can be said of any axis.
+pub(super) fn describe(axis: &Axis, source: Source, warnings: Vec<Warning>) -> Summary {
+    let steps = (axis.length().ceil() as usize).clamp(2, 10_000);
+    let chainages: Vec<f64> =
+        (0..=steps).map(|i| axis.start_chainage() + axis.length() * i as f64 / steps as f64).collect();
+    let gradients: Vec<f64> = chainages.iter().map(|&s| axis.gradient_percent(s)).collect();
+    let bend = chainages.iter().map(|&s| axis.bend_radius(s)).fold(f64::INFINITY, f64::min);
+    let finite = |v: f64| v.is_finite().then_some(v);
+    Summary {
+        source,
+        length_m: axis.length(),
+        start_chainage_m: axis.start_chainage(),
+        end_chainage_m: axis.end_chainage(),
+        azimuth_deg: [axis.azimuth_deg(axis.start_chainage()), axis.azimuth_deg(axis.end_chainage())],
+        gradient_percent: [
+            finite(gradients.iter().copied().fold(f64::INFINITY, f64::min)),
+            finite(gradients.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+        ],
+        least_bend_radius_m: (bend < 1e5).then_some(bend),
+        shaft: axis.is_shaft(),
+        section_radius_m: None,
+        enclosed_share: None,
+        coarse_cell_m: None,
+        coverage: None,
+        smoothing_wavelength_m: None,
+        centre_residual_m: None,
+        ends_at_portal: None,
+        outside_percent: [0.0, 0.0],
+        branches: Vec::new(),
+        warnings,
+    }
+}
