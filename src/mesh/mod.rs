@@ -4,6 +4,8 @@ pub mod reconstruct;
 pub mod repair;
 pub mod section;
 mod section_grid;
+pub mod anchor;
+pub mod nearest_face;
 pub mod surface_point;
 pub mod topology;
 
