@@ -8,19 +8,24 @@ mod crs;
 mod detect;
 mod error;
 mod file_scan;
+pub mod geotiff;
 mod guards;
 mod label_column;
 mod las;
+mod map_folder;
 pub mod ply;
 mod mesh_scan;
+pub mod png;
 mod point_table;
 mod quiet_panics;
 mod source_bytes;
+pub mod world_file;
 mod write;
 
 pub use assemble::{FileSummary, Summary, read_cloud};
 pub use error::{Error, ErrorKind};
 pub use file_scan::{AttributeInfo, Settings, Unit};
+pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
 pub use write::{PointColumns, WriteSummary, write_cloud, write_points};
 

@@ -7,10 +7,10 @@ use super::layer::{
 };
 use super::rasterize::{FaceIndex, NO_FACE, SurfaceTile};
 use super::sampling::{ScatterIndex, Spacing};
-use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, distortion, relief};
+use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, relief};
 use crate::cloud::{Cloud, ScanFrame};
 use crate::numeric::{Vec2, statistics};
-use crate::unwrap::Chart;
+use crate::unwrap::{Chart, distortion};
 use crate::warning::Warning;
 use rayon::prelude::*;
 
@@ -187,7 +187,7 @@ impl<'a> Plan<'a> {
             _ => Vec::new(),
         };
         let stretch: Vec<[f32; 4]> = if wanted.contains(&Layer::Distortion) {
-            (0..mesh.faces().len() as u32).into_par_iter().map(|f| distortion::of_face(input.chart, f)).collect()
+            (0..mesh.faces().len() as u32).into_par_iter().map(|f| stretch_of(input.chart, f)).collect()
         } else {
             Vec::new()
         };
@@ -456,6 +456,12 @@ fn wanted_layers(input: &DrawInput, settings: &Settings, has_points: bool, warni
         wanted.push(Layer::Relief);
     }
     wanted
+}
+
+/// s1, s2, area ratio and direction (degrees) of a face.
+fn stretch_of(chart: &Chart, face: u32) -> [f32; 4] {
+    let d = distortion::of_face(chart.strip().mesh(), chart.uv(), face);
+    [d.s1 as f32, d.s2 as f32, (d.s1 * d.s2) as f32, d.direction.to_degrees() as f32]
 }
 
 /// The stretch at the end of the colours: covers 99 % of the faces, from 1.05 up to 2.

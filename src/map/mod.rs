@@ -7,25 +7,27 @@
 
 mod blend;
 mod color_ramp;
-mod distortion;
 mod draw;
 mod grid;
 mod layer;
+mod overview;
 mod rasterize;
 mod relief;
 mod sampling;
+mod stroke_font;
 
 #[cfg(test)]
 pub(crate) mod example;
 
 pub use blend::Support;
 pub use color_ramp::{Ramp, label_color};
-pub use draw::{DrawInput, Piece, PointsOnMap, Sink, draw};
+pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, draw};
 pub use grid::{Grid, PixelRect, TILE_PX, automatic_cell_m};
 pub use layer::{
     COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, FILLED_COLOR, Layer, LayerDescription, Look, NoData,
     OBSERVED_COLOR, PaletteEntry, Resampling, SampleType, Samples, UNLABELLED_COLOR, color_distance, palette,
 };
+pub use overview::{Picture, chainage_label, overview};
 pub use rasterize::{FaceIndex, NO_FACE, SurfaceTile};
 
 use crate::warning::Warning;
