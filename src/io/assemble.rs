@@ -4,8 +4,9 @@ use super::detect::{self, Format};
 use super::error::Error;
 use super::file_scan::{FileScan, Settings};
 use super::guards::{self, PointGuards};
+use super::poses::Poses;
 use super::source_bytes::SourceBytes;
-use super::{las, ply};
+use super::{e57, las, pcd, ply, text};
 use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile, Station};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
@@ -71,9 +72,13 @@ pub struct FileSummary {
 pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summary), Error> {
     let mut whole: Option<Whole> = None;
     let mut warnings = Vec::new();
+    let poses = settings.poses.as_deref().map(Poses::read).transpose()?.unwrap_or_default();
     for path in files {
         let origin = whole.as_ref().map(|w| w.scan.origin);
-        let mut scan = read_file(path, settings, origin)?;
+        let mut scan = match poses.of(path) {
+            None => read_file(path, settings, origin)?,
+            Some(pose) => pose.apply(path, read_file(path, settings, None)?, origin),
+        };
         refuse_degrees(path, &scan, settings)?;
         let (guards, mut found) = guards::inspect(&scan);
         found.splice(0..0, std::mem::take(&mut scan.warnings));
@@ -103,6 +108,16 @@ pub(super) fn read_file(path: &Path, settings: &Settings, origin: Option<Vec3>) 
         match detect::format_of(&source)? {
             Format::Las => las::read(&source, settings, origin),
             Format::Ply => ply::read(&source, settings, origin),
+            Format::E57 => e57::read(&source, settings, origin),
+            Format::Ptx => text::read_ptx(&source, settings, origin),
+            Format::Pts => text::read_xyz(&source, settings, origin, "PTS"),
+            Format::Xyz => text::read_xyz(&source, settings, origin, "XYZ"),
+            Format::Pcd => pcd::read(&source, settings, origin),
+            Format::Obj | Format::Off | Format::Stl | Format::Glb => Err(Error::unsupported(
+                path,
+                "it is a mesh, not a point cloud",
+                "use `adit unwrap` for meshes, or name a point cloud",
+            )),
         }
     })
 }
@@ -201,7 +216,7 @@ impl Whole {
         self.scan.positions.extend(positions);
         let first_station = self.scan.stations.len() as u16;
         let mine = &mut self.scan.attributes;
-        let context = Append { before, added, path, first: self.files.is_empty() };
+        let context = Append { before, added, path };
         const GREY: [u16; 3] = [0x8080; 3];
         context.column("colours", &mut mine.colors, attributes.colors, GREY, Some("mid grey"), warnings);
         context.column("intensities", &mut mine.intensities, attributes.intensities, 0, Some("0"), warnings);
@@ -260,7 +275,6 @@ struct Append<'a> {
     before: usize,
     added: usize,
     path: &'a Path,
-    first: bool,
 }
 
 impl Append<'_> {
@@ -274,7 +288,6 @@ impl Append<'_> {
         filled_with: Option<&str>,
         warnings: &mut Vec<Warning>,
     ) {
-        debug_assert!(!self.first);
         let one_sided = mine.is_some() != theirs.is_some();
         if let Some(filled_with) = filled_with.filter(|_| one_sided) {
             let who = if mine.is_some() { "has no" } else { "is the first file with" };
@@ -350,7 +363,7 @@ fn unit_of(scan: &FileScan, settings: &Settings, warnings: &mut Vec<Warning>) ->
 }
 
 /// Tunnels are 1 m to 100 km long; other extents point to another unit.
-fn guess_unit(extent: &Vec3, warnings: &mut Vec<Warning>) {
+pub(super) fn guess_unit(extent: &Vec3, warnings: &mut Vec<Warning>) {
     let longest = extent.amax();
     let shortest = extent.amin();
     if longest > 2000.0 && shortest > 500.0 {

@@ -139,6 +139,19 @@ pub(super) struct FileScan {
 }
 
 impl FileScan {
+    /// Adds scanner positions and, for each record, the scanner that saw it.
+    pub(super) fn set_stations(&mut self, stations: Vec<Station>, mut station_of_record: Vec<u16>) {
+        let mut dropped = self.dropped_records.iter().peekable();
+        let mut record = 0u64;
+        station_of_record.retain(|_| {
+            let gone = dropped.next_if(|d| **d == record).is_some();
+            record += 1;
+            !gone
+        });
+        self.attributes.station_ids = Some(station_of_record);
+        self.stations = stations;
+    }
+
     /// A scan whose positions are still absolute: moves them next to a whole-unit origin.
     pub(super) fn relative(mut self, origin: Option<Vec3>) -> Self {
         let (mut low, mut high) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));

@@ -4,7 +4,7 @@ use super::detect::{self, Format};
 use super::error::{COPY_AGAIN, Error};
 use super::file_scan::whole_units;
 use super::source_bytes::SourceBytes;
-use super::{assemble, ply};
+use super::{assemble, mesh_formats, ply};
 use crate::cloud::ScanFrame;
 use crate::numeric::{Vec2, Vec3};
 use crate::warning::Warning;
@@ -213,10 +213,13 @@ pub fn read_mesh(path: &Path) -> Result<(RawMesh, MeshSummary), Error> {
 pub(super) fn read_mesh_source(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     match detect::format_of(source)? {
         Format::Ply => ply::read_mesh(source),
-        Format::Las => Err(Error::unsupported(
-            source.path(),
-            "it is a point cloud, not a mesh",
-            "name a PLY, OBJ, OFF, STL or GLB",
-        )),
+        Format::Obj => mesh_formats::obj(source),
+        Format::Off => mesh_formats::off(source),
+        Format::Stl => mesh_formats::stl(source),
+        Format::Glb => mesh_formats::glb(source),
+        _ => {
+            let remedy = "name a PLY, OBJ, OFF, STL or GLB, or use `adit run` for point clouds";
+            Err(Error::unsupported(source.path(), "it is a point cloud, not a mesh", remedy))
+        }
     }
 }

@@ -6,26 +6,34 @@
 mod assemble;
 mod crs;
 mod detect;
+mod e57;
 mod error;
 mod file_scan;
 pub mod geotiff;
 mod guards;
+mod inspect;
 mod label_column;
 mod las;
 mod map_folder;
 pub mod ply;
+mod mesh_formats;
 mod mesh_scan;
 pub mod png;
+mod pcd;
 mod point_table;
+mod poses;
 mod quiet_panics;
 mod source_bytes;
 pub mod world_file;
+mod text;
 mod write;
 
 pub use assemble::{FileSummary, Summary, read_cloud};
 pub use error::{Error, ErrorKind};
 pub use file_scan::{AttributeInfo, Settings, Unit};
 pub use map_folder::{LabelsFile, MapFolder, write_picture};
+pub use guards::PointGuards;
+pub use inspect::{ScanInfo, StationInfo, inspect};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
 pub use write::{PointColumns, WriteSummary, write_cloud, write_points};
 

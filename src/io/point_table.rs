@@ -157,7 +157,7 @@ impl PointTable {
     }
 
     /// Moves all positions: scanner to scan coordinates.
-    pub(super) fn transform(&mut self, from: usize, map: impl Fn(Vec3) -> Vec3) {
+    pub(super) fn transform(&mut self, from: usize, mut map: impl FnMut(Vec3) -> Vec3) {
         for p in &mut self.positions[from..] {
             *p = map(Vec3::from(*p)).into();
         }
@@ -183,11 +183,22 @@ impl PointTable {
 
     /// Drops rows that are not finite, settles colour and intensity ranges, and chooses the origin.
     pub(super) fn finish(
+        self,
+        roles: &Roles,
+        info: FileInfo,
+        warnings: Vec<Warning>,
+        origin: Option<Vec3>,
+    ) -> FileScan {
+        self.finish_absolute(roles, info, warnings, "a coordinate that is not a number").relative(origin)
+    }
+
+    /// As [`PointTable::finish`], still without an origin; `reason` is what rows without a finite position have.
+    pub(super) fn finish_absolute(
         mut self,
         roles: &Roles,
         mut info: FileInfo,
         mut warnings: Vec<Warning>,
-        origin: Option<Vec3>,
+        reason: &str,
     ) -> FileScan {
         let record_count = self.len() as u64;
         let finite = |p: &[f64; 3]| p.iter().all(|c| c.is_finite());
@@ -197,10 +208,9 @@ impl PointTable {
             let keep: Vec<bool> = self.positions.iter().map(finite).collect();
             self.retain(&keep);
             warnings.push(Warning::new(
-                "not-finite",
+                "dropped-points",
                 format!(
-                    "{} of {record_count} points have a coordinate that is not a number and are dropped (the first is \
-                     record {})",
+                    "{} of {record_count} points have {reason} and are dropped (the first is record {})",
                     dropped.len(),
                     dropped[0]
                 ),
@@ -227,7 +237,7 @@ impl PointTable {
             warnings.push(Warning::new("no-colors", "all colours are zero and are treated as absent"));
             attributes.colors = None;
         }
-        let scan = FileScan {
+        FileScan {
             origin: Vec3::zeros(),
             positions: bytemuck::cast_vec(self.positions),
             attributes,
@@ -236,8 +246,7 @@ impl PointTable {
             dropped_records: dropped,
             info,
             warnings,
-        };
-        scan.relative(origin)
+        }
     }
 }
 

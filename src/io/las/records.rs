@@ -174,7 +174,7 @@ fn plan_plain(
         if !allow_truncated {
             return Err(Error::bad(source.path(), cause, TRUNCATED_REMEDY));
         }
-        warnings.push(Warning::new("truncated", format!("{cause}; they are used because truncated files are allowed")));
+        warnings.push(Warning::new("truncated", format!("{cause}; these can be used with ingest.allow_truncated")));
         count = there;
     } else if there > count {
         warnings.push(Warning::new(

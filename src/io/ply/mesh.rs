@@ -147,6 +147,7 @@ pub(in super::super) fn read_mesh(source: &SourceBytes) -> Result<MeshBuilder, E
             _ => walker.skip(element)?,
         }
     }
+    builder.warnings.extend(walker.warnings());
     if !seen_vertices {
         return Err(Error::bad(path, "it has no element 'vertex'", COPY_AGAIN));
     }

@@ -14,5 +14,5 @@ mod rewrite;
 
 pub(super) use mesh::read_mesh;
 pub use mesh::{PlyMesh, RawMesh, read_chart, write_mesh};
-pub(super) use read::read;
+pub(super) use read::{describe, read};
 pub(super) use rewrite::{rewrite, write_new};

@@ -6,6 +6,7 @@ use super::super::point_table::{ColorRange, PointTable, Roles};
 use super::super::source_bytes::SourceBytes;
 use super::header::{Element, Encoding, Header, Kind, Scalar};
 use crate::numeric::Vec3;
+use crate::warning::Warning;
 use rayon::prelude::*;
 
 /// Vertices decoded at a time by one thread.
@@ -19,7 +20,7 @@ pub(in super::super) fn read(
 ) -> Result<FileScan, Error> {
     let mut header = Header::read(source)?;
     let mut info = info(&header);
-    let warnings = std::mem::take(&mut header.warnings);
+    let mut warnings = std::mem::take(&mut header.warnings);
     let path = source.path();
     let Some((place, vertices)) = header.element("vertex") else {
         return Err(Error::bad(path, "it has no element 'vertex'", "export the scan again"));
@@ -45,7 +46,7 @@ pub(in super::super) fn read(
         (Encoding::LittleEndian | Encoding::BigEndian, Some(stride), 0) => {
             binary(source, &header, vertices, stride, &roles)?
         }
-        _ => walked(source, &header, place, &roles)?,
+        _ => walked(source, &header, place, &roles, &mut warnings)?,
     };
     for column in &vertices.properties {
         if !["intensity", "scalar_intensity"].contains(&column.name.to_ascii_lowercase().as_str()) {
@@ -53,6 +54,16 @@ pub(in super::super) fn read(
         }
     }
     Ok(table.finish(&roles, info, warnings, origin))
+}
+
+/// What the header says, and whether the vertices have all three coordinates.
+pub(in super::super) fn describe(source: &SourceBytes) -> Result<(FileInfo, bool), Error> {
+    let header = Header::read(source)?;
+    let has = |name: &str| {
+        let properties = header.element("vertex").map_or(&[][..], |(_, e)| &e.properties);
+        properties.iter().any(|p| p.name.eq_ignore_ascii_case(name))
+    };
+    Ok((info(&header), ["x", "y", "z"].into_iter().all(has)))
 }
 
 fn info(header: &Header) -> FileInfo {
@@ -115,7 +126,13 @@ fn binary(
 }
 
 /// Text and lists: elements are walked in order.
-fn walked(source: &SourceBytes, header: &Header, place: usize, roles: &Roles) -> Result<PointTable, Error> {
+fn walked(
+    source: &SourceBytes,
+    header: &Header,
+    place: usize,
+    roles: &Roles,
+    warnings: &mut Vec<Warning>,
+) -> Result<PointTable, Error> {
     let bytes = source.up_to(header.data_at, usize::MAX)?;
     let mut walker = Walker::new(source, header, &bytes);
     for element in &header.elements[..place] {
@@ -132,6 +149,7 @@ fn walked(source: &SourceBytes, header: &Header, place: usize, roles: &Roles) ->
         Ok(())
     })?;
     drop(slots);
+    warnings.extend(walker.warnings());
     table.add_bad_labels(bad_labels);
     Ok(table)
 }
@@ -151,11 +169,39 @@ pub(super) struct Walker<'a> {
     encoding: Encoding,
     bytes: &'a [u8],
     pub(super) at: usize,
+    /// Text with one record a line, as it should be: then words that a line has too many do no harm.
+    by_line: bool,
+    /// Lines that had too many words.
+    long_lines: u64,
 }
 
 impl<'a> Walker<'a> {
     pub(super) fn new(source: &'a SourceBytes, header: &Header, bytes: &'a [u8]) -> Self {
-        Self { source, encoding: header.encoding, bytes, at: 0 }
+        let filled = || bytes.split(|&b| b == b'\n').filter(|l| !l.trim_ascii().is_empty()).count() as u64;
+        let records: u64 = header.elements.iter().map(|e| e.count).sum();
+        let by_line = header.encoding == Encoding::Ascii && filled() == records;
+        Self { source, encoding: header.encoding, bytes, at: 0, by_line, long_lines: 0 }
+    }
+
+    /// Words that were skipped, for people.
+    pub(super) fn warnings(&self) -> Option<Warning> {
+        (self.long_lines > 0).then(|| {
+            Warning::new(
+                "ply-long-lines",
+                format!(
+                    "{} lines have more words than the header says; the rest of these lines is ignored",
+                    self.long_lines
+                ),
+            )
+        })
+    }
+
+    /// Goes to the end of the line of a record.
+    fn end_line(&mut self) {
+        let rest = &self.bytes[self.at..];
+        let end = rest.iter().position(|&b| b == b'\n').unwrap_or(rest.len());
+        self.long_lines += u64::from(!rest[..end].trim_ascii().is_empty());
+        self.at += end;
     }
 
     fn number(&mut self, scalar: Scalar) -> Result<f64, String> {
@@ -191,6 +237,9 @@ impl<'a> Walker<'a> {
             row.span[0] = self.at;
             let result = self.row(element, &mut row);
             row.span[1] = self.at;
+            if self.by_line {
+                self.end_line();
+            }
             result.and_then(|()| visit(&row)).map_err(|cause| {
                 let cause = format!("record {record} of {} elements '{}': {cause}", element.count, element.name);
                 Error::bad(self.source.path(), cause, COPY_AGAIN)

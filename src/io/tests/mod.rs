@@ -1,5 +1,8 @@
 //! Round trips through real files.
 
+mod formats;
+mod guards;
+
 use super::*;
 use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile};
 use crate::numeric::Vec3;

@@ -1,0 +1,162 @@
+//! PTX: grids of one or several scans, each with the pose of its scanner.
+//!
+//! A header of ten lines (columns, rows, scanner position, three axes, 4x4 matrix whose *rows* are images of the axes
+//! and of the origin) is followed by one line `x y z intensity [r g b]` for each direction; `0 0 0` means no echo.
+
+use super::super::error::{COPY_AGAIN, Error};
+use super::super::file_scan::{FileInfo, FileScan, Settings};
+use super::super::label_column::LabelSource;
+use super::super::point_table::{ColorRange, PointTable, Roles};
+use super::super::source_bytes::SourceBytes;
+use super::lines::{Line, parse_rows, shorten};
+use crate::cloud::Station;
+use crate::numeric::{Mat3, Vec3};
+use crate::warning::Warning;
+
+struct Head {
+    columns: u64,
+    rows: u64,
+    rotation: Mat3,
+    translation: Vec3,
+    bytes: u64,
+    colored: bool,
+}
+
+/// Reads all scans of a PTX file into the common coordinates of their matrices.
+pub(in super::super) fn read(
+    source: &SourceBytes,
+    settings: &Settings,
+    origin: Option<Vec3>,
+) -> Result<FileScan, Error> {
+    let path = source.path();
+    let mut warnings = Vec::new();
+    let mut stations: Vec<Station> = Vec::new();
+    let mut station_ids: Vec<u16> = Vec::new();
+    let mut all: Option<(PointTable, Roles)> = None;
+    let (mut at, mut line_number, mut silent) = (0u64, 1u64, 0u64);
+    let mut grids = Vec::new();
+    while let Some(head) = read_head(source, at, line_number)? {
+        at += head.bytes;
+        line_number += 10;
+        let count = head.columns.checked_mul(head.rows).filter(|c| c.saturating_mul(8) <= source.len() - at + 8);
+        let Some(count) = count else {
+            let cause = format!(
+                "line {}: a grid of {} x {} points does not fit into the {} bytes that follow",
+                line_number - 10,
+                head.columns,
+                head.rows,
+                source.len() - at
+            );
+            return Err(Error::bad(path, cause, COPY_AGAIN));
+        };
+        let roles = Roles {
+            position: [0, 1, 2],
+            color: head.colored.then_some(([4, 5, 6], ColorRange::EightBit)),
+            intensity: Some(3),
+            classification: None,
+            source_id: None,
+            label: LabelSource::None,
+        };
+        let line = Line { separator: b' ', decimal_comma: false, columns: if head.colored { 7 } else { 4 } };
+        let (mut table, end, next) = parse_rows(source, at, line_number, Some(count), &line, &roles)?;
+        if (table.len() as u64) < count {
+            let cause = format!("scan {} promises {count} points, but only {} follow", stations.len(), table.len());
+            if !settings.allow_truncated {
+                return Err(Error::bad(path, cause, COPY_AGAIN));
+            }
+            warnings.push(Warning::new("truncated", cause));
+        }
+        let (rotation, translation) = (head.rotation, head.translation);
+        check_matrix(&rotation, stations.len(), &mut warnings);
+        table.transform(0, |p| {
+            if p == Vec3::zeros() {
+                silent += 1;
+                return Vec3::repeat(f64::NAN);
+            }
+            rotation * p + translation
+        });
+        station_ids.resize(station_ids.len() + table.len(), stations.len() as u16);
+        stations.push(Station { name: format!("scan {}", stations.len() + 1), position_in_local: translation });
+        grids.push([head.columns, head.rows]);
+        match &mut all {
+            None => all = Some((table, roles)),
+            Some((whole, first)) if first.color.is_some() == head.colored => whole.append(table),
+            Some(_) => {
+                return Err(Error::unsupported(
+                    path,
+                    "some of its scans have colours and some have not",
+                    "split it into one file for each scan",
+                ));
+            }
+        }
+        (at, line_number) = (end, next);
+    }
+    let (table, roles) =
+        all.ok_or_else(|| Error::bad(path, "it has no complete PTX header of ten lines", COPY_AGAIN))?;
+    let mut info = FileInfo::new("PTX");
+    info.header("grids", &grids);
+    info.header("no_echo", silent);
+    let mut scan = table.finish_absolute(&roles, info, warnings, "no echo (0, 0, 0)");
+    scan.set_stations(stations, station_ids);
+    Ok(scan.relative(origin))
+}
+
+fn check_matrix(rotation: &Mat3, scan: usize, warnings: &mut Vec<Warning>) {
+    let determinant = rotation.determinant();
+    let rigid = (rotation.transpose() * rotation - Mat3::identity()).amax() < 1e-3;
+    if determinant < 0.0 {
+        warnings.push(Warning::new(
+            "mirrored-axes",
+            format!(
+                "the matrix of scan {scan} mirrors the scan (determinant {determinant:.3}); left and right would swap \
+                 on the map: check the export"
+            ),
+        ));
+    } else if !rigid {
+        warnings.push(Warning::new(
+            "matrix-not-rigid",
+            format!(
+                "the matrix of scan {scan} stretches lengths (determinant {determinant:.6}); it is applied as it is"
+            ),
+        ));
+    }
+}
+
+fn read_head(source: &SourceBytes, at: u64, line_number: u64) -> Result<Option<Head>, Error> {
+    let head = source.up_to(at, 4096)?;
+    if head.trim_ascii().is_empty() {
+        return Ok(None);
+    }
+    let mut numbers: Vec<Vec<f64>> = Vec::new();
+    let mut bytes = 0;
+    let mut lines = head.split_inclusive(|&b| b == b'\n');
+    let words = |line: &[u8]| -> Option<Vec<f64>> {
+        let text = std::str::from_utf8(line).ok()?;
+        text.split_whitespace().map(|w| w.parse().ok().filter(|v: &f64| v.is_finite())).collect()
+    };
+    for (index, expected) in [1, 1, 3, 3, 3, 3, 4, 4, 4, 4].into_iter().enumerate() {
+        let line = lines.next().unwrap_or(b"");
+        bytes += line.len() as u64;
+        let row = words(line).filter(|w| w.len() == expected).ok_or_else(|| {
+            let cause = format!(
+                "line {}: '{}' should be line {} of a PTX header, with {expected} numbers",
+                line_number + index as u64,
+                shorten(line.trim_ascii()),
+                index + 1
+            );
+            Error::bad(source.path(), cause, COPY_AGAIN)
+        })?;
+        numbers.push(row);
+    }
+    let count = |v: f64| if (0.0..1e12).contains(&v) && v.fract() == 0.0 { v as u64 } else { u64::MAX };
+    let row = |i: usize| Vec3::new(numbers[6 + i][0], numbers[6 + i][1], numbers[6 + i][2]);
+    let colored = lines.next().and_then(words).is_some_and(|w| w.len() >= 7);
+    Ok(Some(Head {
+        columns: count(numbers[0][0]),
+        rows: count(numbers[1][0]),
+        rotation: Mat3::from_columns(&[row(0), row(1), row(2)]),
+        translation: row(3),
+        bytes,
+        colored,
+    }))
+}
