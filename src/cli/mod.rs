@@ -5,6 +5,7 @@
 
 mod console;
 mod exit;
+mod info;
 mod run;
 
 pub use console::Console;
@@ -18,12 +19,15 @@ use std::process::ExitCode;
 enum Command {
     /// Turn a tunnel scan into a flat, metric map (the whole pipeline).
     Run(run::Arguments),
+    /// Tell what is in a scan or mesh file, and what is suspicious about it.
+    Info(info::Arguments),
 }
 
 impl Command {
     fn run(self, console: &Console) -> Result {
         match self {
             Command::Run(arguments) => run::run(arguments, console),
+            Command::Info(arguments) => info::run(arguments, console),
         }
     }
 }

@@ -31,9 +31,9 @@ mod write;
 pub use assemble::{FileSummary, Summary, read_cloud};
 pub use error::{Error, ErrorKind};
 pub use file_scan::{AttributeInfo, Settings, Unit};
-pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use guards::PointGuards;
 pub use inspect::{ScanInfo, StationInfo, inspect};
+pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
 pub use write::{PointColumns, WriteSummary, write_cloud, write_points};
 
