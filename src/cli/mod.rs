@@ -7,6 +7,7 @@ mod console;
 mod exit;
 mod info;
 mod run;
+mod unwrap;
 
 pub use console::Console;
 pub use exit::{Exit, Failure, Result};
@@ -21,6 +22,8 @@ enum Command {
     Run(run::Arguments),
     /// Tell what is in a scan or mesh file, and what is suspicious about it.
     Info(info::Arguments),
+    /// Flatten one mesh.
+    Unwrap(unwrap::Arguments),
 }
 
 impl Command {
@@ -28,6 +31,7 @@ impl Command {
         match self {
             Command::Run(arguments) => run::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
+            Command::Unwrap(arguments) => unwrap::run(arguments, console),
         }
     }
 }

@@ -54,6 +54,12 @@ macro_rules! methods {
                 match self { $(Self::$variant(_) => Freedom::$freedom,)+ }
             }
 
+            /// Whether the method cannot do without the tunnel axis: those that place their result themselves, and those
+            /// that open the tunnel in space.
+            pub fn needs_axis(&self) -> bool {
+                self.freedom() == Freedom::Placed || self.name().starts_with("deform-")
+            }
+
             /// Map coordinates of each vertex, not yet registered.
             pub(super) fn solve(&self, strip: &Strip, guide: Option<&Guide>) -> Result<(Vec<Vec2>, SolveSummary), Error> {
                 match self { $(Self::$variant(settings) => super::$module::flatten(strip, guide, settings),)+ }
@@ -143,4 +149,6 @@ methods! {
     Section(section) = "section", Placed;
     /// Least squares conformal map: keeps angles.
     Lscm(lscm) = "lscm", Similar;
+    /// Relaxed section chart: nearly isometric, yet a chainage ruler. The default.
+    Relax(relax) = "relax", Placed;
 }

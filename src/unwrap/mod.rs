@@ -4,19 +4,24 @@
 //! (right when facing increasing chainage). Faces that run counter-clockwise seen from inside keep that sense in (u, v).
 
 mod conformal;
+pub mod chart_index;
 pub mod distortion;
 pub mod guide;
 pub mod lscm;
 pub mod method;
 pub mod readability;
 pub mod registration;
+pub mod relax;
 mod rigid_fit;
 pub mod section;
 mod triangle_shapes;
 pub mod unfold;
 #[cfg(test)]
 pub(crate) mod closed_form;
+#[cfg(test)]
+mod contract;
 
+pub use chart_index::{ChartIndex, RoundTrip, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
 pub use method::{Freedom, Method};
@@ -130,7 +135,7 @@ impl Chart {
 /// Written `unwrap = "section"` or as a table: `[unwrap.section]` for the method's settings, `[unwrap]` for the rest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// The method. Default `section`.
+    /// The method. Default `relax`.
     pub method: Method,
     /// Distortion is told twice: against the mesh itself, and against the surface smoothed over this distance in
     /// metres, which is what the reader of the map cares about. 0 leaves the second out. Default 0.25.
@@ -143,7 +148,7 @@ const SMOOTHING_M: f64 = 0.25;
 
 impl Default for Settings {
     fn default() -> Self {
-        Self::of(Method::named("section").expect("the default method is in the list"))
+        Self::of(Method::named("relax").expect("the default method is in the list"))
     }
 }
 
@@ -294,7 +299,6 @@ pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result
     }
     let section_settings = match &settings.method {
         Method::Section(own) => own.clone(),
-        #[allow(unreachable_patterns, reason = "the list of methods grows")]
         _ => section::Settings::default(),
     };
     let guide = axis.map(|axis| Guide::of_strip(&strip, axis, &section_settings)).transpose()?;

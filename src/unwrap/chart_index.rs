@@ -1,0 +1,207 @@
+//! From a place on the map back to the surface: (u, v) to face and barycentric coordinates, and the round-trip figure.
+//!
+//! A grid over the chart lists the faces of each cell; the orientation of a place to the three sides of a candidate is
+//! computed in a form that has the same sign from both faces of an edge, so no place between two faces is lost.
+//! Where the chart covers itself, the face with the lowest number answers.
+//! Cost: linear to build, constant a query.
+
+use super::Chart;
+use crate::mesh::SurfacePoint;
+use crate::mesh::anchor::Anchors;
+use crate::numeric::{Vec2, Vec3, statistics};
+use rayon::prelude::*;
+use serde::Serialize;
+
+/// Faces a cell lists on average.
+const FACES_PER_CELL: f64 = 2.0;
+/// A place this little outside a face (barycentric) is inside: rounding.
+const INSIDE: f64 = -1e-9;
+
+/// Finds the face under a place on the map.
+pub struct ChartIndex<'a> {
+    chart: &'a Chart,
+    lowest: Vec2,
+    cell: f64,
+    columns: usize,
+    rows: usize,
+    /// First entry of each cell in `faces`.
+    start: Vec<u32>,
+    faces: Vec<u32>,
+}
+
+impl<'a> ChartIndex<'a> {
+    /// Builds the grid.
+    pub fn of(chart: &'a Chart) -> Self {
+        let mesh = chart.strip().mesh();
+        let (mut lowest, mut highest) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
+        for &v in mesh.faces().iter().flatten() {
+            lowest = lowest.inf(&chart.uv()[v as usize]);
+            highest = highest.sup(&chart.uv()[v as usize]);
+        }
+        let extent = highest - lowest;
+        let count = mesh.faces().len() as f64;
+        // The limit keeps a chart that is much longer than wide, or nearly empty, from needing a huge grid.
+        let cell = (extent.x * extent.y * FACES_PER_CELL / count).sqrt().max(extent.max() / 100_000.0).max(1e-12);
+        let columns = (extent.x / cell) as usize + 1;
+        let rows = (extent.y / cell) as usize + 1;
+        let mut index = Self { chart, lowest, cell, columns, rows, start: Vec::new(), faces: Vec::new() };
+        let mut start = vec![0u32; columns * rows + 1];
+        for f in 0..mesh.faces().len() as u32 {
+            index.for_cells(f, |cell| start[cell + 1] += 1);
+        }
+        for i in 1..start.len() {
+            start[i] += start[i - 1];
+        }
+        let mut fill = start.clone();
+        let mut faces = vec![0u32; start[start.len() - 1] as usize];
+        for f in 0..mesh.faces().len() as u32 {
+            index.for_cells(f, |cell| {
+                faces[fill[cell] as usize] = f;
+                fill[cell] += 1;
+            });
+        }
+        index.start = start;
+        index.faces = faces;
+        index
+    }
+
+    fn for_cells(&self, face: u32, mut visit: impl FnMut(usize)) {
+        let [a, b, c] = self.chart.corners_in_chart(face);
+        let (low, high) = (a.inf(&b).inf(&c) - self.lowest, a.sup(&b).sup(&c) - self.lowest);
+        let last = |i: usize, count: usize| i.min(count - 1);
+        for i in (low.x / self.cell) as usize..=last((high.x / self.cell) as usize, self.columns) {
+            for j in (low.y / self.cell) as usize..=last((high.y / self.cell) as usize, self.rows) {
+                visit(j * self.columns + i);
+            }
+        }
+    }
+
+    /// The surface under a place on the map, at offset 0; `None` beside the map and in its holes.
+    pub fn surface_point(&self, place: Vec2) -> Option<SurfacePoint> {
+        let at = (place - self.lowest) / self.cell;
+        // Places on the border may come out a rounding error beside it.
+        let slack = 1e-9;
+        if !(at.x >= -slack && at.y >= -slack) {
+            return None;
+        }
+        let (i, j) = (at.x.max(0.0) as usize, at.y.max(0.0) as usize);
+        let (i, j) = (i.min(self.columns - 1), j.min(self.rows - 1));
+        if at.x > self.columns as f64 + slack || at.y > self.rows as f64 + slack {
+            return None;
+        }
+        let cell = j * self.columns + i;
+        let mut nearest: Option<(f64, SurfacePoint)> = None;
+        for &face in &self.faces[self.start[cell] as usize..self.start[cell + 1] as usize] {
+            let Some(barycentric) = barycentric(self.chart.corners_in_chart(face), place) else { continue };
+            let lowest = barycentric.iter().copied().fold(f64::INFINITY, f64::min);
+            let point = SurfacePoint { face, barycentric, offset: 0.0 };
+            if lowest >= 0.0 {
+                return Some(point);
+            }
+            if lowest >= INSIDE && nearest.is_none_or(|(best, _)| lowest > best) {
+                nearest = Some((lowest, point));
+            }
+        }
+        nearest.map(|(_, point)| point)
+    }
+}
+
+/// Barycentric coordinates of a place in a counter-clockwise triangle; `None` when it has no area or is flipped.
+fn barycentric([a, b, c]: [Vec2; 3], p: Vec2) -> Option<[f64; 3]> {
+    let area = (b - a).perp(&(c - a));
+    if area <= 0.0 || area.is_nan() {
+        return None;
+    }
+    let (wa, wb) = ((b - p).perp(&(c - p)) / area, (c - p).perp(&(a - p)) / area);
+    Some([wa, wb, 1.0 - wa - wb])
+}
+
+/// What came of sending every anchored point to the map and back.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RoundTrip {
+    /// Points with an exact anchor that were sent.
+    pub points: usize,
+    /// Points under whose place the map has no surface.
+    pub lost: usize,
+    /// Largest distance between a point and what came back, metres.
+    pub max_m: f64,
+    /// 99 % came back nearer than this, metres.
+    pub p99_m: f64,
+}
+
+/// Sends every exactly anchored point to (u, v, offset), finds the surface under (u, v) anew, and measures how far the
+/// point that comes back is from the one that was sent. Nothing of the anchor but (u, v, offset) is used on the way back.
+pub fn round_trip(chart: &Chart, anchors: &Anchors, points: &[Vec3]) -> RoundTrip {
+    let mesh = chart.strip().mesh();
+    let normals = mesh.vertex_normals();
+    let index = ChartIndex::of(chart);
+    let errors: Vec<f64> = (0..points.len())
+        .into_par_iter()
+        .filter(|&i| anchors.is_exact(i))
+        .filter_map(|i| anchors.get(i).map(|anchor| (i, anchor)))
+        .map(|(i, anchor)| match index.surface_point(anchor.in_chart(mesh, chart.uv())) {
+            Some(foot) => {
+                let back = SurfacePoint { offset: anchor.offset, ..foot }.position(mesh, &normals);
+                (back - points[i]).norm()
+            }
+            None => f64::INFINITY,
+        })
+        .collect();
+    let lost = errors.iter().filter(|e| e.is_infinite()).count();
+    let mut found: Vec<f64> = errors.iter().copied().filter(|e| e.is_finite()).collect();
+    let max_m = found.iter().copied().fold(0.0, f64::max);
+    let p99_m = statistics::quantile(&mut found, 0.99).unwrap_or(0.0);
+    RoundTrip { points: errors.len(), lost, max_m, p99_m }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::anchor::{Settings, anchor_points};
+    use crate::unwrap::{self, closed_form};
+
+    #[test]
+    fn points_come_back_through_the_map() {
+        let known = closed_form::rough(80, 90);
+        let (chart, _) = unwrap::flatten(known.strip, Some(&known.axis), &unwrap::Settings::default()).unwrap();
+        let mesh = chart.strip().mesh();
+        // Two points above and below the middle of every face.
+        let points: Vec<Vec3> = (0..mesh.faces().len() as u32)
+            .flat_map(|f| {
+                let [a, b, c] = mesh.corners(f);
+                let (middle, normal) = ((a * 3.0 + b * 2.0 + c) / 6.0, mesh.double_area_vector(f).normalize());
+                [middle + normal * 0.01, middle - normal * 0.02]
+            })
+            .collect();
+        let (anchors, summary) = anchor_points(mesh, &points, &Settings::default());
+        assert!(summary.clamped * 50 < summary.points && summary.unanchored == 0, "{summary:?}");
+        let trip = round_trip(&chart, &anchors, &points);
+        assert_eq!((trip.points, trip.lost), (summary.anchored, 0));
+        assert!(trip.max_m < 1e-9 && trip.p99_m <= trip.max_m, "{trip:?}");
+    }
+
+    #[test]
+    fn a_chart_that_does_not_belong_is_noticed() {
+        let known = closed_form::prism();
+        let mesh = known.strip.mesh().clone();
+        let points: Vec<Vec3> =
+            (0..mesh.faces().len() as u32).map(|f| mesh.corners(f).iter().sum::<Vec3>() / 3.0).collect();
+        let (anchors, _) = anchor_points(&mesh, &points, &Settings::default());
+        // All of the map folded onto one line of faces: the way back cannot tell them apart.
+        let folded: Vec<Vec2> = known.flat.iter().map(|p| Vec2::new((p.x - 6.0).abs(), p.y)).collect();
+        let chart = Chart::new(known.strip, folded).unwrap();
+        let trip = round_trip(&chart, &anchors, &points);
+        assert!(trip.max_m > 1.0 || trip.lost > 0, "{trip:?}");
+    }
+
+    #[test]
+    fn beside_the_map_there_is_nothing() {
+        let known = closed_form::half_cylinder();
+        let chart = Chart::new(known.strip, known.flat).unwrap();
+        let index = ChartIndex::of(&chart);
+        assert_eq!(index.surface_point(Vec2::new(-0.01, 0.0)), None);
+        assert_eq!(index.surface_point(Vec2::new(3.0, 20.0)), None);
+        let middle = index.surface_point(Vec2::new(3.0, 0.1)).unwrap();
+        assert!((middle.in_chart(chart.strip().mesh(), chart.uv()) - Vec2::new(3.0, 0.1)).norm() < 1e-12);
+    }
+}
