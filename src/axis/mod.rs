@@ -134,6 +134,7 @@ pub struct Axis {
     transported_left: Vec<Vec3>,
     /// Chainage (from 0) of each seed.
     seed_lengths: Vec<f64>,
+    seed_points: Vec<[f64; 3]>,
     seed_tree: Arc<ImmutableKdTree<f64, 3>>,
 }
 
@@ -162,7 +163,8 @@ impl Axis {
         let seed_points: Vec<[f64; 3]> = seed_lengths.iter().map(|&s| spline.at_length(s).position.into()).collect();
         // Distinct finite points always build; the tree only refuses NaN-sized trees.
         let seed_tree = ImmutableKdTree::new_from_slice(&seed_points).expect("finite seeds build a tree").into();
-        let mut axis = Self { spline, start_chainage, transported_left: Vec::new(), seed_lengths, seed_tree };
+        let mut axis =
+            Self { spline, start_chainage, transported_left: Vec::new(), seed_lengths, seed_points, seed_tree };
         let limit = SHAFT_INCLINATION_DEG.to_radians().sin();
         let forwards: Vec<Vec3> = axis.seed_lengths.iter().map(|&s| axis.spline.at_length(s).tangent()).collect();
         if forwards.iter().any(|f| f.z.abs() > limit) {
@@ -233,8 +235,7 @@ impl Axis {
     /// Axis coordinates of a local point: its closest point on the axis and the offset in that section.
     pub fn project(&self, point: &Vec3) -> AxisCoordinates {
         let nearest = self.seed_tree.query(&(*point).into()).nearest_one::<SquaredEuclidean<f64>>().execute();
-        let length = self.spline.closest_length(point, self.seed_lengths[nearest.item as usize]);
-        let sample = self.spline.at_length(length);
+        let (length, sample) = self.spline.closest(point, self.seed_lengths[nearest.item as usize]);
         let forward = sample.tangent();
         let left = self.left_at(length, &forward);
         let offset = point - sample.position;
@@ -243,6 +244,13 @@ impl Axis {
             right: -offset.dot(&left),
             up: offset.dot(&forward.cross(&left)),
         }
+    }
+
+    /// The point of the axis nearest to `point` among samples each half metre: much faster than [`Self::project`] where
+    /// only the side matters.
+    pub fn nearest_sample(&self, point: &Vec3) -> Vec3 {
+        let nearest = self.seed_tree.query(&(*point).into()).nearest_one::<SquaredEuclidean<f64>>().execute();
+        Vec3::from(self.seed_points[nearest.item as usize])
     }
 
     /// Azimuth of the forward direction, degrees clockwise from north (+y), 0 to 360.

@@ -19,6 +19,10 @@ pub(super) const DIRECTIONS: usize = 72;
 const WINDOW_RADII: f64 = 5.0;
 /// Length over which errors of a slice's centre hang together, in radii.
 const BLOCK_RADII: f64 = 2.5;
+/// Differences of the centre line below this many radii are not worth a wave.
+const TOLERANCE_RADII: f64 = 0.015;
+/// Slices supported by less than this share of the usual support are not tunnel when they lie beyond the ends.
+const END_SUPPORT: f64 = 0.5;
 /// Rounds of slicing and smoothing.
 const ROUNDS: usize = 6;
 /// A round that moves the axis less than this share of the radius ends the refinement.
@@ -198,10 +202,8 @@ pub(super) fn refine(
     let mut rounds = 0;
     loop {
         rounds += 1;
-        let span = (
-            axis.start_chainage() - if rounds == 1 { reach_m } else { 0.0 },
-            axis.end_chainage() + if rounds == 1 { reach_m } else { 0.0 },
-        );
+        // The void ends before the tunnel does; look beyond until the section stops.
+        let span = (axis.start_chainage() - reach_m, axis.end_chainage() + reach_m);
         let step_m = (0.25 * radius_m).max(least_step_m).max((span.1 - span.0) / 4000.0);
         let slices = slice(points, &axis, step_m, radius_m, span);
         let count = slices.radii.len();
@@ -228,10 +230,11 @@ pub(super) fn refine(
             radius_m = seen;
         }
         let Smoothed { curve, wavelength_m, residual_m } =
-            smooth(&centres, &weights, slices.step_m, BLOCK_RADII * radius_m);
-        // Beyond the outermost slice with something in it the curve is only a guess: straight on instead.
-        let first = weights.iter().position(|w| *w > 0.0).unwrap_or(0);
-        let last = weights.iter().rposition(|w| *w > 0.0).unwrap_or(count - 1);
+            smooth(&centres, &weights, slices.step_m, BLOCK_RADII * radius_m, TOLERANCE_RADII * radius_m);
+        let mut supports: Vec<f64> = weights.iter().copied().filter(|w| *w > 0.0).collect();
+        let enough = END_SUPPORT * END_SUPPORT * median(&mut supports).unwrap_or(0.0);
+        let first = weights.iter().position(|w| *w > enough).unwrap_or(0);
+        let last = weights.iter().rposition(|w| *w > enough).unwrap_or(count - 1);
         let moved = (first..=last).map(|i| (curve[i] - found[i].3).norm()).fold(0.0, f64::max);
         let every = ((KNOT_RADII * radius_m / slices.step_m).round() as usize).max(1);
         let mut knots: Vec<Vec3> = (first..=last).step_by(every).map(|i| curve[i]).collect();

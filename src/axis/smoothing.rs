@@ -31,8 +31,8 @@ pub(super) struct Smoothed {
 }
 
 /// Smooths `centres` at even steps of `step_m` with `weights` (zero: nothing known there). `block_m` is the length
-/// over which errors of the centres hang together.
-pub(super) fn smooth(centres: &[Vec3], weights: &[f64], step_m: f64, block_m: f64) -> Smoothed {
+/// over which errors of the centres hang together; differences of prediction below `tolerance_m` do not matter.
+pub(super) fn smooth(centres: &[Vec3], weights: &[f64], step_m: f64, block_m: f64, tolerance_m: f64) -> Smoothed {
     let n = centres.len();
     let block = ((block_m / step_m).ceil() as usize).max(1);
     let stiffness = |multiple: f64| (multiple * block_m / (std::f64::consts::TAU * step_m)).powi(6);
@@ -41,7 +41,7 @@ pub(super) fn smooth(centres: &[Vec3], weights: &[f64], step_m: f64, block_m: f6
     let mut curve = solve(centres, &robust, stiffness(chosen));
     let mut residual_m = 0.0;
     for _ in 0..ROUNDS {
-        chosen = choose(centres, &robust, block, &stiffness);
+        chosen = choose(centres, &robust, block, &stiffness, tolerance_m);
         curve = solve(centres, &robust, stiffness(chosen));
         let gaps: Vec<f64> = centres.iter().zip(&curve).map(|(y, z)| (y - z).norm()).collect();
         let mut known: Vec<f64> = (0..n).filter(|&i| weights[i] > 0.0).map(|i| gaps[i]).collect();
@@ -55,8 +55,15 @@ pub(super) fn smooth(centres: &[Vec3], weights: &[f64], step_m: f64, block_m: f6
     Smoothed { curve, wavelength_m: chosen * block_m, residual_m }
 }
 
-/// The stiffest of the wavelengths whose prediction of left-out blocks is within one standard error of the best.
-fn choose(centres: &[Vec3], weights: &[f64], block: usize, stiffness: &(impl Fn(f64) -> f64 + Sync)) -> f64 {
+/// The stiffest of the wavelengths whose prediction of left-out blocks is within one standard error (or the tolerance)
+/// of the best.
+fn choose(
+    centres: &[Vec3],
+    weights: &[f64],
+    block: usize,
+    stiffness: &(impl Fn(f64) -> f64 + Sync),
+    tolerance_m: f64,
+) -> f64 {
     let n = centres.len();
     let blocks = n.div_ceil(block);
     if blocks < 4 {
@@ -85,7 +92,7 @@ fn choose(centres: &[Vec3], weights: &[f64], block: usize, stiffness: &(impl Fn(
         })
         .collect();
     let best = (0..scores.len()).min_by(|&a, &b| scores[a].0.total_cmp(&scores[b].0)).expect("wavelengths");
-    let limit = scores[best].0 + scores[best].1;
+    let limit = scores[best].0 + scores[best].1.max(tolerance_m);
     let stiffest = (0..scores.len()).rev().find(|&i| scores[i].0 <= limit).expect("the best is within its error");
     WAVELENGTHS[stiffest]
 }
@@ -149,7 +156,7 @@ mod tests {
     fn parabolas_pass_unchanged() {
         let centres: Vec<Vec3> =
             (0..50).map(|i| i as f64).map(|t| Vec3::new(t, 0.01 * t * t, 1.0 - 0.002 * t * t)).collect();
-        let out = smooth(&centres, &vec![1.0; 50], 1.0, 5.0);
+        let out = smooth(&centres, &vec![1.0; 50], 1.0, 5.0, 0.0);
         for (a, b) in out.curve.iter().zip(&centres) {
             assert!((a - b).norm() < 1e-6, "{a:?} {b:?}");
         }
@@ -176,7 +183,7 @@ mod tests {
             .collect();
         let mut weights = vec![1.0; n];
         weights[100..110].fill(0.0);
-        let out = smooth(&noisy, &weights, 0.5, 12.0);
+        let out = smooth(&noisy, &weights, 0.5, 12.0, 0.02);
         let worst = out.curve.iter().zip(&truth).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
         assert!(worst < 0.2, "{worst} m off at wavelength {} m", out.wavelength_m);
         let rms = (out.curve.iter().zip(&truth).map(|(a, b)| (a - b).norm_squared()).sum::<f64>() / n as f64).sqrt();
@@ -187,7 +194,7 @@ mod tests {
     fn a_wild_centre_is_ignored() {
         let mut centres: Vec<Vec3> = (0..60).map(|i| Vec3::new(i as f64, 0.0, 0.0)).collect();
         centres[30].y = 5.0;
-        let out = smooth(&centres, &vec![1.0; 60], 1.0, 6.0);
+        let out = smooth(&centres, &vec![1.0; 60], 1.0, 6.0, 0.0);
         assert!(out.curve[30].y.abs() < 1e-3, "{}", out.curve[30].y);
     }
 }

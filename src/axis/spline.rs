@@ -91,29 +91,44 @@ impl Spline {
         self.at_parameter(i, t)
     }
 
-    /// Arc length of the point of the curve closest to `point`, searched around `seed_length`.
-    pub fn closest_length(&self, point: &Vec3, seed_length: f64) -> f64 {
-        let mut length = seed_length;
-        for _ in 0..20 {
-            let sample = self.at_length(length);
-            let offset = point - sample.position;
-            let tangent = sample.tangent();
-            let along = offset.dot(&tangent);
-            // d(along)/ds = -1 + offset . curvature vector; damped where the point lies beyond the bend's centre.
-            let inside = length > 0.0 && length < self.length();
-            let bend = if inside {
-                let speed2 = sample.first.norm_squared();
-                let curvature_vector = (sample.second - tangent * sample.second.dot(&tangent)) / speed2;
-                offset.dot(&curvature_vector).min(0.9)
-            } else {
-                0.0
-            };
-            length += along / (1.0 - bend);
-            if along.abs() < 1e-12 {
+    /// Arc length and place of the point of the curve closest to `point`, searched around `seed_length`.
+    ///
+    /// Newton's method in the parameter, so that arc length is integrated only once.
+    pub fn closest(&self, point: &Vec3, seed_length: f64) -> (f64, Sample) {
+        let last = self.knots.len() - 1;
+        let (first_t, last_t) = (self.parameters[0], self.parameters[last]);
+        let mut i = self.lengths.partition_point(|&l| l <= seed_length).clamp(1, last) - 1;
+        let share = (seed_length - self.lengths[i]) / (self.lengths[i + 1] - self.lengths[i]);
+        let mut t = self.parameters[i] + share * (self.parameters[i + 1] - self.parameters[i]);
+        t = t.clamp(first_t, last_t);
+        for _ in 0..40 {
+            let sample = self.at_parameter(i, t);
+            let offset = sample.position - point;
+            let slope = offset.dot(&sample.first);
+            let speed2 = sample.first.norm_squared();
+            if (t == first_t && slope > 0.0) || (t == last_t && slope < 0.0) {
+                // Straight on beyond the ends.
+                let tangent = sample.tangent();
+                let beyond = -offset.dot(&tangent);
+                let end = if t == first_t { 0.0 } else { self.length() };
+                return (end + beyond, Sample { position: sample.position + tangent * beyond, ..sample });
+            }
+            // Damped where the point lies beyond the centre of the bend.
+            let curvature = (speed2 + offset.dot(&sample.second)).max(0.1 * speed2);
+            let next = (t - slope / curvature).clamp(first_t, last_t);
+            let step = (next - t).abs();
+            t = next;
+            while i > 0 && t < self.parameters[i] {
+                i -= 1;
+            }
+            while i + 1 < last && t >= self.parameters[i + 1] {
+                i += 1;
+            }
+            if step * speed2.sqrt() < 1e-13 * (1.0 + last_t) {
                 break;
             }
         }
-        length
+        (self.lengths[i] + self.arc_length(i, self.parameters[i], t), self.at_parameter(i, t))
     }
 
     fn at_parameter(&self, i: usize, t: f64) -> Sample {

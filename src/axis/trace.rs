@@ -8,7 +8,7 @@
 
 use super::enclosed_void::{EnclosedVoid, State, edge_for, enclosed_void};
 use super::sections::{DIRECTIONS, Refined, direction_of, refine, slice};
-use super::skeleton::{Skeleton, skeleton};
+use super::skeleton::{self, Skeleton};
 use super::{Axis, AxisCoordinates, Error};
 use crate::clean::Spacing;
 use crate::cloud::ScanFrame;
@@ -35,6 +35,8 @@ const LEAST_SHARE_HALF_OPEN: f64 = 0.6;
 /// Length over width that is at least needed: for a tunnel, and for a half-open one.
 const LEAST_ASPECT: f64 = 0.5;
 const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
+/// How far beyond the ends of the void more tunnel is looked for, in radii of the section.
+const REACH_RADII: f64 = 8.0;
 /// The tunnel ends where less than this share of the usual directions is covered.
 const PORTAL_COVERAGE: f64 = 0.6;
 /// Steeper than this from end to end, chainage runs downwards.
@@ -192,10 +194,16 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     }
     let spacing = Spacing::estimate(&sample);
     let mut warnings = Vec::new();
-    let void = find_void(&sample, &spacing, &mut warnings)?;
-    let skeleton = skeleton(&void, settings.ends.map(|e| e.map(Vec3::from)));
-    if let (Some(arm_m), None) = (skeleton.loop_arm_m, settings.ends) {
-        return Err(Error::ClosedLoop { arm_m });
+    let ends = settings.ends.map(|e| e.map(Vec3::from));
+    let mut void = find_void(&sample, &spacing, false, &mut warnings)?;
+    let mut skeleton = skeleton::skeleton(&void, ends);
+    if skeleton.loop_arm_m.is_some() && ends.is_none() {
+        // In a very short tunnel only a ring along the wall is well enclosed; with more patience its middle is too.
+        void = find_void(&sample, &spacing, true, &mut warnings)?;
+        skeleton = skeleton::skeleton(&void, ends);
+        if let Some(arm_m) = skeleton.loop_arm_m {
+            return Err(Error::ClosedLoop { arm_m });
+        }
     }
     let rough = rough_axis(&skeleton, &void)?;
     let volume = skeleton.main_cells.len() as f64 * void.grid.cell_m.powi(3);
@@ -270,7 +278,12 @@ fn not_a_tunnel(reason: &'static str, void: Option<&EnclosedVoid>, length_m: f64
 }
 
 /// The enclosed void on a grid fine enough to see it and coarse enough that walls have no gaps.
-fn find_void(points: &[Vec3], spacing: &Spacing, warnings: &mut Vec<Warning>) -> Result<EnclosedVoid, Error> {
+fn find_void(
+    points: &[Vec3],
+    spacing: &Spacing,
+    only_patiently: bool,
+    warnings: &mut Vec<Warning>,
+) -> Result<EnclosedVoid, Error> {
     let finest = (2.5 * spacing.along_m).max(1.15 * spacing.across_m);
     let coarsest = edge_for(points, SURFACE_CELLS).max(finest);
     let search = |share: f64, least_share: f64| {
@@ -291,7 +304,7 @@ fn find_void(points: &[Vec3], spacing: &Spacing, warnings: &mut Vec<Warning>) ->
             cell_m = (0.6 * cell_m).max(finest);
         }
     };
-    let closed = search(ENCLOSED, LEAST_SHARE);
+    let closed = if only_patiently { None } else { search(ENCLOSED, LEAST_SHARE) };
     if let Some(void) = closed.as_ref().filter(|v| v.enclosed_share >= LEAST_SHARE) {
         let length_m = length_of(void);
         if length_m >= LEAST_ASPECT * 2.0 * void.clearance_m && void.clearance_m >= 2.0 * void.grid.cell_m {
@@ -301,12 +314,15 @@ fn find_void(points: &[Vec3], spacing: &Spacing, warnings: &mut Vec<Warning>) ->
     let open = search(HALF_OPEN, LEAST_SHARE_HALF_OPEN);
     if let Some(void) = open.as_ref().filter(|v| v.enclosed_share >= LEAST_SHARE_HALF_OPEN) {
         let length_m = length_of(void);
-        if length_m >= LEAST_ASPECT_HALF_OPEN * 2.0 * void.clearance_m && void.clearance_m >= 2.0 * void.grid.cell_m {
-            warnings.push(Warning::new(
-                "half-open-section",
+        let least_aspect = if only_patiently { LEAST_ASPECT } else { LEAST_ASPECT_HALF_OPEN };
+        if length_m >= least_aspect * 2.0 * void.clearance_m && void.clearance_m >= 2.0 * void.grid.cell_m {
+            let message = if only_patiently {
+                "the tunnel is shorter than wide; its axis is uncertain"
+            } else {
                 "the section is open on one side (a trench, or a floor or roof that was not scanned); the axis follows \
-                 what is there",
-            ));
+                 what is there"
+            };
+            warnings.push(Warning::new("half-open-section", message));
             return Ok(open.expect("just looked at"));
         }
         return Err(not_a_tunnel("the enclosed space is not elongated", Some(void), length_m));
@@ -382,7 +398,7 @@ fn surface_of(points: &[Vec3], void: &EnclosedVoid, skeleton: &Skeleton, rough: 
             }
             let c = rough.project(p);
             let beyond = (rough.start_chainage() - c.chainage).max(c.chainage - rough.end_chainage());
-            beyond > -radius_m && beyond < 2.0 * radius_m && c.radius() < 1.6 * radius_m
+            beyond > -radius_m && beyond < REACH_RADII * radius_m && c.radius() < 1.6 * radius_m
         })
         .collect();
     points.iter().zip(keep).filter(|(_, k)| *k).map(|(p, _)| *p).collect()

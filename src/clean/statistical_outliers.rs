@@ -20,6 +20,8 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+/// Most neighbours that the settings allow.
+const MOST_NEIGHBOURS: usize = 16;
 /// Standard deviations of `ln r` beyond which a point is isolated.
 const SIGMAS: f64 = 6.0;
 /// Makes the median absolute deviation of a normal distribution its standard deviation.
@@ -34,7 +36,7 @@ const SPARSE_RATIO: f64 = 20.0;
 pub struct StatisticalOutliers {
     /// Whether isolated points are dropped at all.
     pub enabled: bool,
-    /// Number of nearest neighbours looked at, 2 to 64.
+    /// Number of nearest neighbours looked at, 2 to 16.
     pub neighbours: usize,
     /// The automatic limit on the ratio is not below this.
     pub min_ratio: f64,
@@ -51,8 +53,8 @@ impl Default for StatisticalOutliers {
 impl StatisticalOutliers {
     pub(super) fn check(&self) -> Result<(), Error> {
         let refuse = |key, value, range| Err(Error::Setting { key, value, range });
-        if !(2..=64).contains(&self.neighbours) {
-            return refuse("statistical_outliers.neighbours", self.neighbours as f64, "2 to 64");
+        if !(2..=MOST_NEIGHBOURS).contains(&self.neighbours) {
+            return refuse("statistical_outliers.neighbours", self.neighbours as f64, "2 to 16");
         }
         if !(self.min_ratio > 1.0 && self.min_ratio.is_finite()) {
             return refuse("statistical_outliers.min_ratio", self.min_ratio, "more than 1");
@@ -82,16 +84,24 @@ pub fn remove_statistical_outliers(points: &[Vec3], settings: &StatisticalOutlie
     }
     let k = settings.neighbours;
     // The point itself is its own nearest neighbour.
-    let found: Vec<(f32, Vec<u32>)> = for_each_neighbourhood(points, k + 1, |i, neighbours| {
-        let others = || neighbours.iter().filter(|n| n.index as usize != i);
-        let sum: f64 = others().map(|n| n.distance_squared.sqrt()).sum();
-        ((sum / k as f64) as f32, others().map(|n| n.index).collect())
+    let found: Vec<(f32, [u32; MOST_NEIGHBOURS])> = for_each_neighbourhood(points, k + 1, |i, neighbours| {
+        let mut sum = 0.0;
+        let mut others = [0; MOST_NEIGHBOURS];
+        let all = neighbours.iter().filter(|n| n.index as usize != i).take(k);
+        for (other, n) in others.iter_mut().zip(all) {
+            *other = n.index;
+            sum += n.distance_squared.sqrt();
+        }
+        ((sum / k as f64) as f32, others)
     });
     let logs: Vec<f64> = found
         .par_iter()
         .map(|(own, neighbours)| {
-            let mut theirs: Vec<f64> = neighbours.iter().map(|&n| f64::from(found[n as usize].0)).collect();
-            let typical = median(&mut theirs).unwrap_or(0.0);
+            let mut theirs = [0.0; MOST_NEIGHBOURS];
+            for (distance, &n) in theirs.iter_mut().zip(&neighbours[..k]) {
+                *distance = f64::from(found[n as usize].0);
+            }
+            let typical = median(&mut theirs[..k]).unwrap_or(0.0);
             if f64::from(*own) <= typical { 0.0 } else { (f64::from(*own) / typical).ln() }
         })
         .collect();
@@ -99,7 +109,9 @@ pub fn remove_statistical_outliers(points: &[Vec3], settings: &StatisticalOutlie
     let log_limit = ratio.ln();
     let mut distances: Vec<f64> = found.par_iter().map(|f| f64::from(f.0)).collect();
     let sparse_limit_m = SPARSE_RATIO * median(&mut distances).unwrap_or(f64::INFINITY);
-    let is_kept = |(log, (own, _)): (&f64, &(f32, Vec<u32>))| *log <= log_limit && f64::from(*own) <= sparse_limit_m;
+    let is_kept = |(log, (own, _)): (&f64, &(f32, [u32; MOST_NEIGHBOURS]))| {
+        *log <= log_limit && f64::from(*own) <= sparse_limit_m
+    };
     Verdict { kept: logs.par_iter().zip(&found).map(is_kept).collect(), ratio, sparse_limit_m }
 }
 

@@ -70,6 +70,11 @@ impl VoxelGrid {
         &self.order
     }
 
+    /// All point indices, cell after cell, by value.
+    pub fn into_order(self) -> Vec<u32> {
+        self.order
+    }
+
     /// Integer coordinates of the cell around a point.
     pub fn cell_around(&self, point: &Vec3) -> [i64; 3] {
         ((point - self.origin) / self.cell_m).map(|c| c.floor() as i64).into()
