@@ -8,6 +8,7 @@ mod exit;
 mod info;
 mod run;
 mod unwrap;
+mod synth;
 
 pub use console::Console;
 pub use exit::{Exit, Failure, Result};
@@ -24,6 +25,8 @@ enum Command {
     Info(info::Arguments),
     /// Flatten one mesh.
     Unwrap(unwrap::Arguments),
+    /// Make a synthetic scan of a tunnel that is known in closed form.
+    Synth(synth::Arguments),
 }
 
 impl Command {
@@ -32,6 +35,7 @@ impl Command {
             Command::Run(arguments) => run::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),
+            Command::Synth(arguments) => synth::run(arguments, console),
         }
     }
 }

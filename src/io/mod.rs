@@ -35,7 +35,7 @@ pub use guards::PointGuards;
 pub use inspect::{ScanInfo, StationInfo, inspect};
 pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
-pub use write::{PointColumns, WriteSummary, write_cloud, write_points};
+pub use write::{PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
 
 #[cfg(test)]
 mod tests;

@@ -71,6 +71,9 @@ pub fn write_points(cloud: &Cloud, columns: &PointColumns, destination: &Path) -
     }
 }
 
+/// Steps of the coordinates in new LAS files, metres: a tenth of a millimetre.
+const NEW_STEP_M: f64 = 1e-4;
+
 /// Writes a cloud as a new file: LAS 1.4 (LAS, LAZ) or binary little endian PLY, by the destination's extension.
 ///
 /// Coordinates are written in scan units: exactly in PLY, in steps of a tenth of a millimetre in LAS. Without
@@ -79,11 +82,25 @@ pub fn write_points(cloud: &Cloud, columns: &PointColumns, destination: &Path) -
 /// # Errors
 /// [`Error`] when the destination cannot be written or its extension is none of `las`, `laz`, `ply`.
 pub fn write_cloud(cloud: &Cloud, columns: Option<&PointColumns>, destination: &Path) -> Result<WriteSummary, Error> {
+    write_cloud_in_steps(cloud, columns, destination, NEW_STEP_M)
+}
+
+/// [`write_cloud`] with LAS coordinates in steps of about `step_m` (the nearest power of ten in scan units): coarser
+/// steps make smaller LAZ files.
+///
+/// # Errors
+/// As [`write_cloud`].
+pub fn write_cloud_in_steps(
+    cloud: &Cloud,
+    columns: Option<&PointColumns>,
+    destination: &Path,
+    step_m: f64,
+) -> Result<WriteSummary, Error> {
     if let Some(columns) = columns {
         columns.check(cloud, destination)?;
     }
     match detect::extension(destination).as_str() {
-        "las" | "laz" => las::write_new(cloud, columns, destination),
+        "las" | "laz" => las::write_new(cloud, columns, destination, step_m),
         "ply" => ply::write_new(cloud, columns, destination),
         other => {
             Err(Error::output(destination, format!("'.{other}' is no point format"), "name it .laz, .las or .ply"))

@@ -36,7 +36,7 @@ impl Fracture {
             offset: normal.dot(&through),
             centre: through,
             radius_m: f64::INFINITY,
-            half_width_m: 0.02,
+            half_width_m: 0.03,
             groove_m: 0.012,
         }
     }

@@ -123,7 +123,7 @@ mod tests {
             position: Vec3::new(3.0, -1.0, 1.0),
             depth: 0.0,
             slope: [0.0; 2],
-            trace: (f64::INFINITY, 0.02),
+            trace: (f64::INFINITY, 0.03),
             is_floor: false,
             paint: None,
         }

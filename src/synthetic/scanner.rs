@@ -74,6 +74,8 @@ pub struct ScanPlan {
     pub saturation_range_m: f64,
     /// Half the opening of the blind cone below the instrument, degrees.
     pub nadir_cone_deg: f64,
+    /// Whether points have colours.
+    pub colored: bool,
     /// Where the local origin lies in the coordinates of the scan.
     pub origin_in_scan: Vec3,
     /// Same seed, same scan.
@@ -92,6 +94,7 @@ impl Default for ScanPlan {
             max_range_m: 40.0,
             saturation_range_m: 3.0,
             nadir_cone_deg: 30.0,
+            colored: true,
             origin_in_scan: Vec3::zeros(),
             seed: 1,
         }
@@ -133,6 +136,14 @@ pub enum Error {
         value: f64,
         /// The allowed range, in words.
         must_be: &'static str,
+    },
+    /// There is no room for something.
+    #[error("there is no room for {what}: it needs {needs}; leave it out or choose another section")]
+    NoRoom {
+        /// The thing.
+        what: &'static str,
+        /// What it needs.
+        needs: &'static str,
     },
     /// The columns do not form a cloud; a defect of the generator.
     #[error(transparent)]
@@ -523,7 +534,7 @@ fn assemble(plan: &ScanPlan, stations: &[Vec3], shots: Vec<(usize, Vec<Shot>)>) 
     let station_ids: Vec<u16> = shots.iter().flat_map(|(k, s)| std::iter::repeat_n(*k as u16, s.len())).collect();
     let shots: Vec<Shot> = shots.into_iter().flat_map(|(_, s)| s).collect();
     let attributes = Attributes {
-        colors: Some(shots.iter().map(|s| s.color).collect()),
+        colors: plan.colored.then(|| shots.iter().map(|s| s.color).collect()),
         intensities: Some(shots.iter().map(|s| s.intensity).collect()),
         labels: Some(shots.iter().map(|s| s.label).collect()),
         source_ids: Some(station_ids.iter().map(|k| k + 1).collect()),

@@ -537,20 +537,18 @@ fn patch_header(header: &mut Container, tally: &Tally, summary: &mut WriteSummar
     }
 }
 
-/// Steps of the coordinates in new files, metres: a tenth of a millimetre.
-const NEW_STEP_M: f64 = 1e-4;
-
 /// Writes a cloud as LAS 1.4, point format 7 with colours and 6 without.
 pub(in super::super) fn write_new(
     cloud: &Cloud,
     columns: Option<&PointColumns>,
     destination: &Path,
+    step_m: f64,
 ) -> Result<WriteSummary, Error> {
     let frame = cloud.frame();
     let attributes = cloud.attributes();
     let format = if attributes.colors.is_some() { 7 } else { 6 };
     let layout = Layout::of(format);
-    let step = NEW_STEP_M / frame.metres_per_unit;
+    let step = step_m / frame.metres_per_unit;
     // A power of ten: coordinates read back as the decimal numbers that people expect.
     let step = 10f64.powf(step.log10().round());
     let origin = frame.origin_in_scan;
