@@ -132,6 +132,8 @@ pub struct Axis {
     start_chainage: f64,
     /// Frame without gravity (shafts): twist-free `left` at each seed; empty when gravity defines the frame.
     transported_left: Vec<Vec3>,
+    /// Where the crown line of a shaft was asked to face; north when not.
+    crown_azimuth_deg: Option<f64>,
     /// Chainage (from 0) of each seed.
     seed_lengths: Vec<f64>,
     seed_points: Vec<[f64; 3]>,
@@ -163,14 +165,32 @@ impl Axis {
         let seed_points: Vec<[f64; 3]> = seed_lengths.iter().map(|&s| spline.at_length(s).position.into()).collect();
         // Distinct finite points always build; the tree only refuses NaN-sized trees.
         let seed_tree = ImmutableKdTree::new_from_slice(&seed_points).expect("finite seeds build a tree").into();
-        let mut axis =
-            Self { spline, start_chainage, transported_left: Vec::new(), seed_lengths, seed_points, seed_tree };
+        let mut axis = Self {
+            spline,
+            start_chainage,
+            transported_left: Vec::new(),
+            crown_azimuth_deg: None,
+            seed_lengths,
+            seed_points,
+            seed_tree,
+        };
         let limit = SHAFT_INCLINATION_DEG.to_radians().sin();
         let forwards: Vec<Vec3> = axis.seed_lengths.iter().map(|&s| axis.spline.at_length(s).tangent()).collect();
         if forwards.iter().any(|f| f.z.abs() > limit) {
             axis.transported_left = transport_left(&forwards, &Vec3::y());
         }
         Ok(axis)
+    }
+
+    /// The points that the curve goes through, local metres: with [`Self::start_chainage`] and
+    /// [`Self::crown_azimuth_deg`] they make the same axis again.
+    pub fn knots(&self) -> &[Vec3] {
+        self.spline.knots()
+    }
+
+    /// What [`Self::with_crown_azimuth`] was given, if it had an effect.
+    pub fn crown_azimuth_deg(&self) -> Option<f64> {
+        self.crown_azimuth_deg
     }
 
     /// Chainage of the first point, metres.
@@ -206,6 +226,7 @@ impl Axis {
             let forwards: Vec<Vec3> = self.seed_lengths.iter().map(|&s| self.spline.at_length(s).tangent()).collect();
             let (sin, cos) = azimuth_deg.to_radians().sin_cos();
             self.transported_left = transport_left(&forwards, &Vec3::new(sin, cos, 0.0));
+            self.crown_azimuth_deg = Some(azimuth_deg);
         }
         self
     }

@@ -1,6 +1,9 @@
 //! `adit run`: the whole pipeline.
 
 use super::{Console, Exit, Failure, Result};
+use crate::pipeline::{self, Kind, Observer, Pipeline, STAGES, limits::Status, report};
+use crate::warning::Warning;
+use serde_json::json;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -8,7 +11,11 @@ Examples:
   adit run --input drift.laz --out runs/drift
   adit run --input station1.e57 --input station2.e57 --out runs/drift --set map.cell_m=0.005
   adit run pipelines/nightly.toml --input drift.laz --out runs/drift --set unwrap=lscm
-  adit run pipelines/quick.toml --check";
+  adit run pipelines/quick.toml --check
+
+The same command again does nothing; a changed key redoes what depends on it. An interrupted run goes on where it was.
+The run folder then holds report.json (numbers and verdict), map/ (rasters and pictures), points.laz (every point with
+chainage, girth and offset), mesh.ply, chart.ply, axis.csv and pipeline.toml (all settings that were used).";
 
 /// Arguments of `adit run`.
 #[derive(clap::Args)]
@@ -20,7 +27,7 @@ pub struct Arguments {
     /// A scan or mesh file; several files are one scan. Replaces the input named in the pipeline file.
     #[arg(long, value_name = "FILE", num_args = 1..)]
     input: Vec<PathBuf>,
-    /// The run folder. Made if missing.
+    /// The run folder. Made if missing; by default `runs/` and the name of the pipeline file or the scan.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Override one key of the pipeline, e.g. `map.cell_m=0.005` or `unwrap=lscm`. May be repeated.
@@ -32,7 +39,82 @@ pub struct Arguments {
 }
 
 /// Runs the pipeline.
-pub fn run(arguments: Arguments, _console: &Console) -> Result {
-    let _ = (arguments.pipeline, arguments.input, arguments.out, arguments.set, arguments.check);
-    Err(Failure::message(Exit::Unsupported, "the stages are not connected yet"))
+pub fn run(arguments: Arguments, console: &Console) -> Result {
+    let mut pipeline = match &arguments.pipeline {
+        Some(path) => Pipeline::load(path, &arguments.set),
+        None => Pipeline::from_overrides(&arguments.set),
+    }
+    .map_err(|error| Failure::new(Exit::Usage, error))?;
+    if !arguments.input.is_empty() {
+        pipeline.input = arguments.input;
+        pipeline.make_inputs_absolute();
+    }
+    if arguments.check {
+        console.print(pipeline.to_toml().trim_end());
+        return Ok(Exit::Done);
+    }
+    let named_after = arguments.pipeline.as_ref().or(pipeline.input.first());
+    let out = arguments
+        .out
+        .or_else(|| Some(PathBuf::from("runs").join(named_after?.file_stem()?)))
+        .ok_or_else(|| Failure::from(pipeline::Error::NoInput))?;
+    let outcome = pipeline::run(&pipeline, &out, &Progress { console })?;
+    console.finish_bar();
+    let mut lines = vec![format!("{} {}", headline(outcome.status), out.display())];
+    lines.extend(report::summary_lines(&outcome.report));
+    if !outcome.worked {
+        lines.insert(0, "nothing to do: same input, settings and version as before".to_owned());
+    }
+    if !console.is_quiet() {
+        console.print(&lines.join("\n"));
+    }
+    Ok(if outcome.status == Status::Fail { Exit::LimitBroken } else { Exit::Done })
+}
+
+fn headline(status: Status) -> &'static str {
+    match status {
+        Status::Pass => "PASS",
+        Status::Warn => "PASS with warnings:",
+        Status::Fail => "FAIL (a limit was broken; the products are kept):",
+    }
+}
+
+impl From<pipeline::Error> for Failure {
+    fn from(error: pipeline::Error) -> Self {
+        let exit = match error.kind() {
+            Kind::Usage => Exit::Usage,
+            Kind::BadInput => Exit::BadInput,
+            Kind::Unsupported => Exit::Unsupported,
+            Kind::Resources => Exit::Resources,
+            Kind::Internal => Exit::Internal,
+        };
+        Failure::new(exit, error)
+    }
+}
+
+/// Shows the stages on the console.
+pub(super) struct Progress<'a> {
+    pub(super) console: &'a Console,
+}
+
+impl Observer for Progress<'_> {
+    fn started(&self, stage: &'static str) {
+        let position = STAGES.iter().position(|s| s.name == stage).unwrap_or(0);
+        self.console.start_bar(position as u64, STAGES.len() as u64, stage);
+    }
+
+    fn finished(&self, stage: &'static str, seconds: f64, reused: bool) {
+        let text = if reused { format!("{stage:<8} as before") } else { format!("{stage:<8} {seconds:7.2} s") };
+        let fields = [("stage", json!(stage)), ("seconds", json!(seconds)), ("reused", json!(reused))];
+        if !self.console.is_quiet() {
+            self.console.log("info", &text, &fields);
+        }
+    }
+
+    fn warned(&self, stage: &'static str, warning: &Warning) {
+        if !self.console.is_quiet() {
+            let text = format!("{stage}: {}", warning.message);
+            self.console.log("warning", &text, &[("stage", json!(stage)), ("code", json!(warning.code))]);
+        }
+    }
 }

@@ -1,1 +1,16 @@
 //! The whole run: pipeline file, stages in order, limits, report, run folder.
+
+mod checkpoint;
+mod error;
+mod known_keys;
+pub mod limits;
+mod line;
+pub mod report;
+mod run;
+pub mod run_folder;
+pub mod settings;
+
+pub use error::{Error, Kind};
+pub use line::{Observer, Stage, reset_peak_memory};
+pub use run::{Outcome, STAGES, run};
+pub use settings::Pipeline;

@@ -107,6 +107,18 @@ impl SectionField {
         Self::from_radii(start, (end - start) / 2.0, 2, values, observed)
     }
 
+    /// What makes the same field again with [`Self::from_columns`]: start and step in metres, radii, observed cells.
+    pub fn columns(&self) -> (f64, f64, &[f64], &[bool]) {
+        (self.start, self.step, &self.radius, &self.observed)
+    }
+
+    /// A field from what [`Self::columns`] gave; `None` when the columns do not fit each other.
+    pub fn from_columns(start: f64, step: f64, radius: Vec<f64>, observed: Vec<bool>) -> Option<Self> {
+        let rows = radius.len() / COLUMNS;
+        let sound = rows > 0 && radius.len() == rows * COLUMNS && observed.len() == radius.len() && step > 0.0;
+        (sound && radius.iter().all(|r| *r > 0.0)).then(|| Self::from_radii(start, step, rows, radius, observed))
+    }
+
     fn from_radii(start: f64, step: f64, rows: usize, radius: Vec<f64>, observed: Vec<bool>) -> Self {
         let mut girth = vec![0.0; rows * (COLUMNS + 1)];
         let d_angle = TAU / COLUMNS as f64;

@@ -1,0 +1,245 @@
+//! The quality gate: what a finished run must keep to, and the verdict.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// Levels of one measure. A plain number is the level at which the run fails.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Levels {
+    /// Beyond this the run carries a warning.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub warn: Option<f64>,
+    /// Beyond this the run fails (exit code 5); its products are kept and marked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fail: Option<f64>,
+}
+
+impl Levels {
+    const fn fail_at(fail: f64) -> Self {
+        Self { warn: None, fail: Some(fail) }
+    }
+
+    const fn at(warn: f64, fail: f64) -> Self {
+        Self { warn: Some(warn), fail: Some(fail) }
+    }
+}
+
+impl<'de> Deserialize<'de> for Levels {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Visitor;
+        impl<'de> serde::de::Visitor<'de> for Visitor {
+            type Value = Levels;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+                f.write_str("a number (the level that fails) or a table { warn = ..., fail = ... }")
+            }
+
+            fn visit_f64<E>(self, fail: f64) -> Result<Levels, E> {
+                Ok(Levels::fail_at(fail))
+            }
+
+            fn visit_i64<E>(self, fail: i64) -> Result<Levels, E> {
+                Ok(Levels::fail_at(fail as f64))
+            }
+
+            fn visit_u64<E>(self, fail: u64) -> Result<Levels, E> {
+                Ok(Levels::fail_at(fail as f64))
+            }
+
+            fn visit_map<A: serde::de::MapAccess<'de>>(self, mut map: A) -> Result<Levels, A::Error> {
+                let mut levels = Levels::default();
+                while let Some(key) = map.next_key::<String>()? {
+                    match key.as_str() {
+                        "warn" => levels.warn = Some(map.next_value()?),
+                        "fail" => levels.fail = Some(map.next_value()?),
+                        other => return Err(serde::de::Error::unknown_field(other, &["warn", "fail"])),
+                    }
+                }
+                Ok(levels)
+            }
+        }
+        deserializer.deserialize_any(Visitor)
+    }
+}
+
+/// When a finished run counts as good. Each limit is a number (fails beyond it) or `{ warn = ..., fail = ... }`;
+/// an empty table `{}` switches a limit off.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Most faces that are mirrored or collapsed on the map.
+    pub flipped_faces: Levels,
+    /// Least observed share of the map, percent.
+    pub coverage_percent: Levels,
+    /// Most stretch of the smoothed surface that 95 % of the area keep to, percent, beyond what the bend explains.
+    pub distortion_p95_percent: Levels,
+    /// Most distance between a point and its way to the map and back, 99th percentile, pixels.
+    pub roundtrip_p99_px: Levels,
+    /// Most points of the input without a record in the output.
+    pub lost_points: Levels,
+    /// Most surface that no point supports, percent.
+    pub filled_percent: Levels,
+    /// Longest duration, seconds.
+    pub duration_s: Levels,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            flipped_faces: Levels::fail_at(0.0),
+            coverage_percent: Levels::at(95.0, 90.0),
+            distortion_p95_percent: Levels::at(10.0, 15.0),
+            roundtrip_p99_px: Levels::at(0.1, 1.0),
+            lost_points: Levels::fail_at(0.0),
+            filled_percent: Levels { warn: Some(10.0), fail: None },
+            duration_s: Levels::default(),
+        }
+    }
+}
+
+/// How a check, or the whole run, came out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Status {
+    /// Within all levels.
+    Pass,
+    /// Beyond a warning level.
+    Warn,
+    /// Beyond a failing level.
+    Fail,
+}
+
+impl Status {
+    /// The word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Pass => "pass",
+            Self::Warn => "warn",
+            Self::Fail => "fail",
+        }
+    }
+}
+
+/// Which side of a level is good.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Sense {
+    /// The value should not be greater.
+    AtMost,
+    /// The value should not be smaller.
+    AtLeast,
+}
+
+/// One limit with the value that was measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Check {
+    /// Name of the limit, as in the pipeline file.
+    pub name: String,
+    /// What was measured; absent when the run does not tell it.
+    pub value: Option<f64>,
+    /// Unit of the value and the levels.
+    pub unit: String,
+    /// Whether the levels are upper or lower bounds.
+    pub sense: Sense,
+    /// Level of warning.
+    pub warn: Option<f64>,
+    /// Level of failing.
+    pub fail: Option<f64>,
+    /// How it came out.
+    pub status: Status,
+    /// One sentence for a person.
+    pub message: String,
+}
+
+impl Check {
+    /// Judges a value.
+    pub fn of(name: &str, what: &str, unit: &str, sense: Sense, levels: Levels, value: Option<f64>) -> Self {
+        let beyond = |level: Option<f64>| match (level, value) {
+            (Some(level), Some(value)) => match sense {
+                // A value that is not a number keeps to no level.
+                Sense::AtMost => !(value <= level),
+                Sense::AtLeast => !(value >= level),
+            },
+            _ => false,
+        };
+        let status = match (beyond(levels.warn), beyond(levels.fail)) {
+            (_, true) => Status::Fail,
+            (true, false) => Status::Warn,
+            (false, false) => Status::Pass,
+        };
+        let spaced = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+        let bound = match sense {
+            Sense::AtMost => "at most",
+            Sense::AtLeast => "at least",
+        };
+        let allowed = match if status == Status::Warn { levels.warn } else { levels.fail.or(levels.warn) } {
+            Some(level) => format!(" ({bound} {}{spaced})", number(level)),
+            None => String::new(),
+        };
+        let message = match value {
+            Some(value) => format!("{what}: {}{spaced}{allowed}", number(value)),
+            None => format!("{what}: not measured{allowed}"),
+        };
+        Self {
+            name: name.to_owned(),
+            value,
+            unit: unit.to_owned(),
+            sense,
+            warn: levels.warn,
+            fail: levels.fail,
+            status,
+            message,
+        }
+    }
+}
+
+/// The worst status of the checks.
+pub fn verdict(checks: &[Check]) -> Status {
+    checks.iter().map(|c| c.status).max().unwrap_or(Status::Pass)
+}
+
+/// A number for a person: four significant digits, no needless zeros.
+pub fn number(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return format!("{value}");
+    }
+    if value.fract() == 0.0 && value.abs() < 1e15 {
+        return format!("{value:.0}");
+    }
+    let magnitude = value.abs().log10().floor() as i32;
+    if !(-4..=9).contains(&magnitude) {
+        return format!("{value:.2e}");
+    }
+    let text = format!("{value:.*}", (3 - magnitude).max(0) as usize);
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_on_the_level_keeps_to_it() {
+        let flips = |n| Check::of("flipped_faces", "flipped faces", "", Sense::AtMost, Levels::fail_at(0.0), Some(n)).status;
+        assert_eq!((flips(0.0), flips(1.0)), (Status::Pass, Status::Fail));
+        let coverage =
+            |c| Check::of("c", "coverage", "%", Sense::AtLeast, Levels::at(95.0, 90.0), Some(c)).status;
+        assert_eq!((coverage(95.0), coverage(94.9), coverage(89.9)), (Status::Pass, Status::Warn, Status::Fail));
+        assert_eq!(coverage(f64::NAN), Status::Fail);
+    }
+
+    #[test]
+    fn levels_read_from_a_number_or_a_table() {
+        let read = |text: &str| toml::from_str::<Limits>(text);
+        assert_eq!(read("flipped_faces = 3").unwrap().flipped_faces, Levels::fail_at(3.0));
+        assert_eq!(read("coverage_percent = { warn = 80 }").unwrap().coverage_percent.warn, Some(80.0));
+        assert_eq!(read("coverage_percent = {}").unwrap().coverage_percent, Levels::default());
+        assert!(read("coverage_percent = 'high'").unwrap_err().message().contains("a number"));
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        assert_eq!([1.0 / 3.0, 1234.56, 0.00012345, 5.0].map(number), ["0.3333", "1235", "0.0001234", "5"]);
+    }
+}

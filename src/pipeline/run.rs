@@ -1,0 +1,272 @@
+//! The straight line from scan to map.
+
+use super::checkpoint::{self, Checkpoint};
+use super::error::Error;
+use super::line::{self, Line, Observer, Stage, done, section};
+use super::limits::Status;
+use super::report;
+use super::run_folder::{RunFolder, sha256_of};
+use super::settings::Pipeline;
+use crate::axis::{self, Axis};
+use crate::cloud::{Cloud, ScanFrame};
+use crate::io::ply::{PlyMesh, write_mesh};
+use crate::mesh::anchor::{self, Anchors};
+use crate::mesh::{self, Mesh};
+use crate::numeric::{Vec2, statistics};
+use crate::segment::{self, SectionField};
+use crate::unwrap::{self, Chart};
+use crate::{clean, cut, io, map};
+use rayon::prelude::*;
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The stages in their order. Raise a version when the stage gives other results for the same input.
+pub const STAGES: &[Stage] = &[
+    Stage { name: "ingest", version: 1, needs: &[] },
+    Stage { name: "clean", version: 1, needs: &["ingest"] },
+    Stage { name: "axis", version: 1, needs: &["clean"] },
+    Stage { name: "segment", version: 1, needs: &["clean", "axis"] },
+    Stage { name: "mesh", version: 1, needs: &["segment", "axis"] },
+    Stage { name: "cut", version: 1, needs: &["mesh", "axis"] },
+    Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
+    Stage { name: "anchor", version: 1, needs: &["unwrap", "ingest"] },
+    Stage { name: "map", version: 1, needs: &["anchor", "unwrap", "mesh", "ingest"] },
+    Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
+];
+
+/// Distance between the lines of `axis.csv`, metres.
+const AXIS_CSV_STEP_M: f64 = 0.5;
+
+/// How a run ended.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// The verdict of the limits.
+    pub status: Status,
+    /// The report, as in `report.json`.
+    pub report: serde_json::Value,
+    /// Whether anything had to be done.
+    pub worked: bool,
+}
+
+/// The surface and the mean section that it deviates from.
+struct Surface {
+    mesh: Mesh,
+    section: SectionField,
+}
+
+/// Runs the pipeline in a run folder, doing only what is not there yet.
+///
+/// # Errors
+/// [`Error`] with the stage that refused. The folder then holds the products of the stages before it.
+pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<Outcome, Error> {
+    if pipeline.input.is_empty() {
+        return Err(Error::NoInput);
+    }
+    let input_hashes = hash_inputs(&pipeline.input)?;
+    let folder = RunFolder::open(out)?;
+    folder.refuse_inputs_inside(&pipeline.input, &["points.laz", "points.ply", "mesh.ply", "chart.ply"])?;
+    let plans = line::plan(STAGES, |stage| pipeline.settings_of(stage), |stage| match stage {
+        "ingest" => input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone())).collect(),
+        _ => BTreeMap::new(),
+    });
+    let line = Line::new(&folder, observer, plans);
+    for stage in STAGES.iter().filter(|s| line.is_fresh(s.name)) {
+        observer.finished(stage.name, 0.0, true);
+    }
+
+    let cloud = line.passing("ingest", |_| done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest)));
+    let cleaned = line.passing("clean", |_| done("clean", clean::clean(&*cloud.get()?, &pipeline.clean)));
+    let axis = line.product("axis", |staging| {
+        let frame = cloud.get()?.frame().clone();
+        let result = done("axis", axis::trace(cleaned.get()?.positions(), &pipeline.axis.in_local(&frame)))?;
+        let path = staging.join("axis.csv");
+        std::fs::write(&path, axis_csv(&result.0, &frame)).map_err(cannot_write("axis", &path))?;
+        Ok(result)
+    });
+    let segmentation = line.passing("segment", |_| {
+        let axis = axis.get()?;
+        done("segment", segment::classify_positions(cleaned.get()?.positions(), &axis, &pipeline.segment))
+    });
+    let surface = line.product("mesh", |staging| {
+        let segmentation = segmentation.get()?;
+        cleaned.release();
+        let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &*axis.get()?, &pipeline.mesh))?;
+        write_ply("mesh", &staging.join("mesh.ply"), &*cloud.get()?, &mesh, None)?;
+        Ok((Surface { mesh, section: segmentation.section.clone() }, summary))
+    });
+    let strip = line.passing("cut", |_| {
+        let mesh = surface.get()?.mesh.clone();
+        segmentation.release();
+        done("cut", cut::open(mesh, &*axis.get()?, &pipeline.cut))
+    });
+    let chart = line.product("unwrap", |staging| {
+        let axis = axis.get()?;
+        let (chart, summary) = done("unwrap", unwrap::flatten(strip.take()?, Some(&axis), &pipeline.unwrap))?;
+        write_ply("unwrap", &staging.join("chart.ply"), &*cloud.get()?, chart.strip().mesh(), Some(chart.uv()))?;
+        Ok((chart, summary))
+    });
+    let placed = line.product("anchor", |_| {
+        let (cloud, chart) = (cloud.get()?, chart.get()?);
+        let mesh = chart.strip().mesh();
+        let (anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
+        let roundtrip = roundtrip(&anchors, mesh, &cloud);
+        let mut summary = section(&summary);
+        summary["roundtrip"] = roundtrip;
+        Ok((PlacedPoints { uv: anchors.in_chart(mesh, chart.uv()), offsets_m: anchors.offsets().to_vec() }, summary))
+    });
+    let map = line.passing("map", |staging| {
+        let (cloud, chart, axis, surface) = (cloud.get()?, chart.get()?, axis.get()?, surface.get()?);
+        let placed = placed.get()?;
+        let offsets = section_offsets(chart.strip().mesh(), &axis, &surface.section);
+        let input = map::DrawInput {
+            chart: &chart,
+            points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
+            frame: cloud.frame(),
+            section_offsets_m: Some(&offsets),
+        };
+        let folder = staging.join("map");
+        std::fs::create_dir(&folder).map_err(cannot_write("map", &folder))?;
+        let mut sink = io::MapFolder::new(&folder);
+        done("map", map::draw(&input, &pipeline.map, &mut sink))
+    });
+    let points = line.passing("points", |staging| {
+        let (cloud, placed) = (cloud.get()?, placed.get()?);
+        let labels = cloud.attributes().labels.clone().unwrap_or_else(|| vec![0; cloud.len()]);
+        let columns = io::PointColumns {
+            labels: &labels,
+            chainage: &placed.uv.iter().map(|p| p.x).collect::<Vec<_>>(),
+            girth: &placed.uv.iter().map(|p| p.y).collect::<Vec<_>>(),
+            offset: &placed.offsets_m,
+        };
+        let written = io::write_points(&cloud, &columns, &staging.join(points_file(&pipeline.input)));
+        done("points", written.map(|summary| ((), summary)))
+    });
+    axis.ensure()?;
+    surface.ensure()?;
+    chart.ensure()?;
+    placed.ensure()?;
+    points.ensure()?;
+    map.ensure()?;
+    report::finish(pipeline, &line, &folder, &input_hashes)
+}
+
+/// Where the points of the scan lie on the map.
+struct PlacedPoints {
+    /// Chainage and girth; NaN without a place.
+    uv: Vec<Vec2>,
+    /// Distance from the surface, metres.
+    offsets_m: Vec<f64>,
+}
+
+impl Checkpoint for PlacedPoints {
+    fn save(&self, columns: &mut checkpoint::Writer) {
+        self.uv.save(columns);
+        columns.put("offsets", &self.offsets_m);
+    }
+
+    fn load(columns: &checkpoint::Reader) -> Result<Self, checkpoint::Error> {
+        Ok(Self { uv: Checkpoint::load(columns)?, offsets_m: columns.get("offsets")? })
+    }
+}
+
+impl Checkpoint for Surface {
+    fn save(&self, columns: &mut checkpoint::Writer) {
+        self.mesh.save(columns);
+        self.section.save(columns);
+    }
+
+    fn load(columns: &checkpoint::Reader) -> Result<Self, checkpoint::Error> {
+        Ok(Self { mesh: Mesh::load(columns)?, section: SectionField::load(columns)? })
+    }
+}
+
+impl Checkpoint for Chart {
+    fn save(&self, columns: &mut checkpoint::Writer) {
+        self.strip().mesh().save(columns);
+        self.uv().to_vec().save(columns);
+    }
+
+    fn load(columns: &checkpoint::Reader) -> Result<Self, checkpoint::Error> {
+        let strip = cut::Strip::load(columns)?;
+        Chart::new(strip, Checkpoint::load(columns)?).map_err(|e| columns.damaged(e))
+    }
+}
+
+/// Hashes of the input files; a file that cannot be read is bad input, told by its name.
+fn hash_inputs(files: &[PathBuf]) -> Result<Vec<String>, Error> {
+    let hash = |path: &PathBuf| {
+        sha256_of(path).map_err(|error| match error {
+            super::run_folder::Error::Io { path, source, .. } => {
+                Error::in_stage("ingest")(io::Error::Read { path, source })
+            }
+            other => other.into(),
+        })
+    };
+    files.iter().map(hash).collect()
+}
+
+/// Name of the file with all points: PLY stays PLY, everything else becomes LAZ.
+fn points_file(inputs: &[PathBuf]) -> &'static str {
+    let is_ply = |p: &PathBuf| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"));
+    if inputs.iter().all(is_ply) { "points.ply" } else { "points.laz" }
+}
+
+/// Distance of each vertex from the local mean section, metres, positive into the void.
+fn section_offsets(mesh: &Mesh, axis: &Axis, section: &SectionField) -> Vec<f64> {
+    let offset = |p| {
+        let c = axis.project(p);
+        section.radius(c.chainage, c.angle()) - c.radius()
+    };
+    mesh.vertices().par_iter().map(offset).collect()
+}
+
+/// How far the points are from where their anchors say they are, metres. Points clamped at a border are left out:
+/// they are counted, not certified.
+fn roundtrip(anchors: &Anchors, mesh: &Mesh, cloud: &Cloud) -> serde_json::Value {
+    let normals = mesh.vertex_normals();
+    let positions = cloud.positions();
+    let mut errors: Vec<f64> = (0..anchors.len())
+        .into_par_iter()
+        .filter(|&i| anchors.is_exact(i))
+        .filter_map(|i| anchors.get(i).map(|a| (a.position(mesh, &normals) - positions[i]).norm()))
+        .collect();
+    let max = errors.iter().copied().fold(0.0, f64::max);
+    let p99 = statistics::quantile(&mut errors, 0.99);
+    json!({ "points": errors.len(), "max_m": max, "p99_m": p99 })
+}
+
+/// The axis as `axis.csv`, scan coordinates.
+fn axis_csv(axis: &Axis, frame: &ScanFrame) -> String {
+    let mut text = String::from("chainage_m,x,y,z,azimuth_deg,gradient_percent\n");
+    let steps = (axis.length() / AXIS_CSV_STEP_M).floor() as usize;
+    let mut chainages: Vec<f64> = (0..=steps).map(|i| axis.start_chainage() + i as f64 * AXIS_CSV_STEP_M).collect();
+    if axis.end_chainage() - chainages[steps] > 1e-6 {
+        chainages.push(axis.end_chainage());
+    }
+    for s in chainages {
+        let p = frame.scan_from_local(&axis.frame_at(s).origin);
+        let (azimuth, gradient) = (axis.azimuth_deg(s), axis.gradient_percent(s));
+        text += &format!("{s:.4},{:.4},{:.4},{:.4},{azimuth:.4},{gradient:.4}\n", p.x, p.y, p.z);
+    }
+    text
+}
+
+fn write_ply(stage: &'static str, path: &Path, cloud: &Cloud, mesh: &Mesh, uv: Option<&[Vec2]>) -> Result<(), Error> {
+    let observed = mesh.observed_vertices();
+    let ply = PlyMesh {
+        frame: cloud.frame(),
+        vertices: mesh.vertices(),
+        uv,
+        faces: mesh.faces(),
+        observed_vertices: Some(&observed),
+        observed_faces: Some(mesh.observed()),
+    };
+    write_mesh(&ply, path).map_err(Error::in_stage(stage))
+}
+
+fn cannot_write(stage: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
+    move |source| {
+        Error::in_stage(stage)(super::run_folder::Error::Io { action: "write", path: path.to_owned(), source })
+    }
+}
