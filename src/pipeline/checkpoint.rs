@@ -59,11 +59,6 @@ impl Writer {
         self.columns.push((name.to_owned(), size_of::<T>(), bytes.to_vec()));
     }
 
-    /// Adds a text.
-    pub fn put_text(&mut self, name: &str, text: &str) {
-        self.put(name, text.as_bytes());
-    }
-
     /// Writes the file and waits until it is on disk.
     ///
     /// # Errors
@@ -129,14 +124,6 @@ impl Reader {
             return Err(self.damaged(format!("column '{name}' has another type")));
         }
         Ok(bytemuck::pod_collect_to_vec(bytes))
-    }
-
-    /// A text.
-    ///
-    /// # Errors
-    /// [`Error::Damaged`].
-    pub fn get_text(&self, name: &str) -> Result<String, Error> {
-        String::from_utf8(self.get(name)?).map_err(|_| self.damaged(format!("text '{name}' does not read")))
     }
 
     /// A value written as a column of one.
@@ -236,13 +223,11 @@ mod tests {
         let values = [f64::NAN, -0.0, f64::MIN_POSITIVE, 0.1 + 0.2];
         let mut columns = Writer::default();
         columns.put("a", &values);
-        columns.put_text("t", "gr\u{fc}n\n");
         columns.put("b", &[1u8, 2, 3]);
         columns.write(&path).unwrap();
         let back = Reader::open(&path).unwrap();
         let bits = |v: &[f64]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
         assert_eq!(bits(&back.get::<f64>("a").unwrap()), bits(&values));
-        assert_eq!(back.get_text("t").unwrap(), "gr\u{fc}n\n");
         assert!(back.get::<u32>("a").is_err() && back.get::<u8>("missing").is_err());
     }
 

@@ -1,7 +1,7 @@
 //! What keeps a run from finishing: which stage, what happened there, and whose problem it is.
 
 use super::{checkpoint, run_folder, settings};
-use crate::{axis, clean, cut, io, map, mesh, normals, segment, unwrap};
+use crate::{axis, clean, cut, io, map, mesh, segment, unwrap};
 
 /// Whose problem an error is; the command line turns it into an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,6 +28,14 @@ pub enum Error {
     /// No input was named.
     #[error("no input: name a scan with --input FILE, or with `input = [\"FILE\"]` in the pipeline file")]
     NoInput,
+    /// A mesh among several files.
+    #[error("{meshes} of the {files} input files are meshes: name one mesh, or only scans")]
+    SeveralMeshes {
+        /// How many are meshes.
+        meshes: usize,
+        /// How many files were named.
+        files: usize,
+    },
     /// The run folder cannot be used.
     #[error(transparent)]
     RunFolder(#[from] run_folder::Error),
@@ -47,7 +55,7 @@ impl Error {
     /// Whose problem it is.
     pub fn kind(&self) -> Kind {
         match self {
-            Self::Settings(_) | Self::NoInput => Kind::Usage,
+            Self::Settings(_) | Self::NoInput | Self::SeveralMeshes { .. } => Kind::Usage,
             Self::RunFolder(error) => error.kind(),
             Self::Stage { kind, .. } => *kind,
         }

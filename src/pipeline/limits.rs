@@ -221,10 +221,10 @@ mod tests {
 
     #[test]
     fn a_value_on_the_level_keeps_to_it() {
-        let flips = |n| Check::of("flipped_faces", "flipped faces", "", Sense::AtMost, Levels::fail_at(0.0), Some(n)).status;
+        let flips =
+            |n| Check::of("flipped_faces", "flipped faces", "", Sense::AtMost, Levels::fail_at(0.0), Some(n)).status;
         assert_eq!((flips(0.0), flips(1.0)), (Status::Pass, Status::Fail));
-        let coverage =
-            |c| Check::of("c", "coverage", "%", Sense::AtLeast, Levels::at(95.0, 90.0), Some(c)).status;
+        let coverage = |c| Check::of("c", "coverage", "%", Sense::AtLeast, Levels::at(95.0, 90.0), Some(c)).status;
         assert_eq!((coverage(95.0), coverage(94.9), coverage(89.9)), (Status::Pass, Status::Warn, Status::Fail));
         assert_eq!(coverage(f64::NAN), Status::Fail);
     }

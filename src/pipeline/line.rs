@@ -91,6 +91,10 @@ impl<'a> Line<'a> {
         Self { folder, observer, plans, records: records.into(), nested_seconds: 0.0.into(), worked: false.into() }
     }
 
+    pub(super) fn plans(&self) -> &[Plan] {
+        &self.plans
+    }
+
     pub(super) fn plan(&self, stage: &str) -> &Plan {
         self.plans.iter().find(|p| p.stage.name == stage).expect("every stage is planned")
     }

@@ -3,7 +3,7 @@
 use super::error::Error;
 use super::limits::{Check, Limits, Sense, Status, number, verdict};
 use super::line::{Line, peak_memory_bytes};
-use super::run::{Outcome, STAGES};
+use super::run::Outcome;
 use super::run_folder::{Record, RunFolder, read_record, sha256_of_bytes};
 use super::settings::Pipeline;
 use serde_json::{Map, Value, json};
@@ -19,7 +19,7 @@ pub(super) fn finish(
     input_hashes: &[String],
 ) -> Result<Outcome, Error> {
     let toml = pipeline.to_toml();
-    let keys: Vec<String> = STAGES.iter().map(|s| line.plan(s.name).key.clone()).collect();
+    let keys: Vec<&str> = line.plans().iter().map(|p| p.key.as_str()).collect();
     let key_text = json!([SCHEMA_VERSION, env!("CARGO_PKG_VERSION"), keys, toml]).to_string();
     let key = sha256_of_bytes(key_text.as_bytes());
     if !line.has_worked()
@@ -36,7 +36,11 @@ pub(super) fn finish(
     let text = format!("{}\n", serde_json::to_string_pretty(&report).expect("a report is plain data"));
     for (name, content) in [("report.json", &text), ("pipeline.toml", &toml)] {
         let path = staging.join(name);
-        std::fs::write(&path, content).map_err(|source| super::run_folder::Error::Io { action: "write", path, source })?;
+        std::fs::write(&path, content).map_err(|source| super::run_folder::Error::Io {
+            action: "write",
+            path,
+            source,
+        })?;
     }
     let files = folder.publish(&staging)?;
     let record = Record {
@@ -78,7 +82,7 @@ fn compose(pipeline: &Pipeline, line: &Line, input_hashes: &[String]) -> Value {
     report.insert("warnings".into(), Value::Null);
     let (mut warnings, mut products) = (Vec::new(), Vec::new());
     let (mut seconds, mut peak) = (0.0, 0u64);
-    for stage in STAGES {
+    for stage in line.plans().iter().map(|p| p.stage) {
         let Some(record) = line.record(stage.name) else { continue };
         let mut section = match record.summary {
             Value::Object(section) => section,
@@ -176,7 +180,8 @@ pub fn checks(limits: &Limits, report: &Value) -> Vec<Check> {
 /// A wall at half width `w` of a bend with radius `r` is `1 + w / r` as long as its chainage.
 fn bend_stretch(report: &Value) -> f64 {
     let radius = report.pointer("/axis/least_bend_radius_m").and_then(Value::as_f64);
-    let half_width = report.pointer("/segment/mean_perimeter_m").and_then(Value::as_f64).map(|p| p / std::f64::consts::TAU);
+    let half_width =
+        report.pointer("/segment/mean_perimeter_m").and_then(Value::as_f64).map(|p| p / std::f64::consts::TAU);
     match radius.zip(half_width) {
         Some((radius, half_width)) if radius > half_width => half_width / radius,
         _ => 0.0,
@@ -193,7 +198,9 @@ pub fn summary_lines(report: &Value) -> Vec<String> {
     if let (Some(points), Some(kept)) = (at("/ingest/points"), at("/clean/geometry_points")) {
         line("scan", format!("{} points, {} carry the geometry", count(points), count(kept)));
     }
-    if let (Some(length), Some(start), Some(end)) = (at("/axis/length_m"), at("/axis/start_chainage_m"), at("/axis/end_chainage_m")) {
+    if let (Some(length), Some(start), Some(end)) =
+        (at("/axis/length_m"), at("/axis/start_chainage_m"), at("/axis/end_chainage_m"))
+    {
         let perimeter = at("/segment/mean_perimeter_m").map_or(String::new(), |p| format!(", perimeter {p:.2} m"));
         line("tunnel", format!("{length:.1} m, chainage {start:.2} to {end:.2}{perimeter}"));
     }

@@ -2,17 +2,17 @@
 
 use super::checkpoint::{self, Checkpoint};
 use super::error::Error;
-use super::line::{self, Line, Observer, Stage, done, section};
 use super::limits::Status;
+use super::line::{self, Line, Observer, Stage, done, section};
 use super::report;
 use super::run_folder::{RunFolder, sha256_of};
 use super::settings::Pipeline;
-use crate::axis::{self, Axis};
+use crate::axis::{self, Axis, AxisCoordinates};
 use crate::cloud::{Cloud, ScanFrame};
 use crate::io::ply::{PlyMesh, write_mesh};
 use crate::mesh::anchor::{self, Anchors};
-use crate::mesh::{self, Mesh};
-use crate::numeric::{Vec2, statistics};
+use crate::mesh::{self, FaceId, Mesh};
+use crate::numeric::{Vec2, Vec3, statistics};
 use crate::segment::{self, SectionField};
 use crate::unwrap::{self, Chart};
 use crate::{clean, cut, io, map};
@@ -33,6 +33,16 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "anchor", version: 1, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 1, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
+];
+
+/// The stages of a run that starts from a mesh.
+pub const MESH_STAGES: &[Stage] = &[
+    Stage { name: "ingest", version: 1, needs: &[] },
+    Stage { name: "axis", version: 1, needs: &["ingest"] },
+    Stage { name: "mesh", version: 1, needs: &["ingest", "axis"] },
+    Stage { name: "cut", version: 1, needs: &["mesh", "axis"] },
+    Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
+    Stage { name: "map", version: 1, needs: &["unwrap", "mesh", "ingest"] },
 ];
 
 /// Distance between the lines of `axis.csv`, metres.
@@ -64,24 +74,45 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
         return Err(Error::NoInput);
     }
     let input_hashes = hash_inputs(&pipeline.input)?;
+    let alignment_hash = hash_inputs(pipeline.axis.alignment.as_slice())?;
+    let poses_hash = hash_inputs(pipeline.ingest.poses.as_slice())?;
     let folder = RunFolder::open(out)?;
     folder.refuse_inputs_inside(&pipeline.input, &["points.laz", "points.ply", "mesh.ply", "chart.ply"])?;
-    let plans = line::plan(STAGES, |stage| pipeline.settings_of(stage), |stage| match stage {
-        "ingest" => input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone())).collect(),
-        _ => BTreeMap::new(),
-    });
+    let from_mesh = is_mesh(&pipeline.input, &pipeline.ingest)?;
+    let stages = if from_mesh { MESH_STAGES } else { STAGES };
+    let plans = line::plan(
+        stages,
+        |stage| pipeline.settings_of(stage),
+        |stage| match stage {
+            "ingest" => {
+                let poses = poses_hash.iter().map(|h| ("poses".to_owned(), h.clone()));
+                input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone())).chain(poses).collect()
+            }
+            "axis" => alignment_hash.iter().map(|h| ("alignment".to_owned(), h.clone())).collect(),
+            _ => BTreeMap::new(),
+        },
+    );
     let line = Line::new(&folder, observer, plans);
-    for stage in STAGES.iter().filter(|s| line.is_fresh(s.name)) {
+    for stage in stages.iter().filter(|s| line.is_fresh(s.name)) {
         observer.finished(stage.name, 0.0, true);
     }
 
+    if from_mesh {
+        run_mesh(pipeline, &line)?;
+    } else {
+        run_scan(pipeline, &line)?;
+    }
+    report::finish(pipeline, &line, &folder, &input_hashes)
+}
+
+/// From a scan to everything.
+fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error> {
     let cloud = line.passing("ingest", |_| done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest)));
     let cleaned = line.passing("clean", |_| done("clean", clean::clean(&*cloud.get()?, &pipeline.clean)));
     let axis = line.product("axis", |staging| {
         let frame = cloud.get()?.frame().clone();
-        let result = done("axis", axis::trace(cleaned.get()?.positions(), &pipeline.axis.in_local(&frame)))?;
-        let path = staging.join("axis.csv");
-        std::fs::write(&path, axis_csv(&result.0, &frame)).map_err(cannot_write("axis", &path))?;
+        let result = find_axis(pipeline, cleaned.get()?.positions(), &frame)?;
+        write_text("axis", &staging.join("axis.csv"), &axis_csv(&result.0, &frame))?;
         Ok(result)
     });
     let segmentation = line.passing("segment", |_| {
@@ -92,7 +123,7 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
         let segmentation = segmentation.get()?;
         cleaned.release();
         let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &*axis.get()?, &pipeline.mesh))?;
-        write_ply("mesh", &staging.join("mesh.ply"), &*cloud.get()?, &mesh, None)?;
+        write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
         Ok((Surface { mesh, section: segmentation.section.clone() }, summary))
     });
     let strip = line.passing("cut", |_| {
@@ -103,7 +134,7 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
     let chart = line.product("unwrap", |staging| {
         let axis = axis.get()?;
         let (chart, summary) = done("unwrap", unwrap::flatten(strip.take()?, Some(&axis), &pipeline.unwrap))?;
-        write_ply("unwrap", &staging.join("chart.ply"), &*cloud.get()?, chart.strip().mesh(), Some(chart.uv()))?;
+        write_ply("unwrap", &staging.join("chart.ply"), cloud.get()?.frame(), chart.strip().mesh(), Some(chart.uv()))?;
         Ok((chart, summary))
     });
     let placed = line.product("anchor", |_| {
@@ -125,10 +156,7 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
             frame: cloud.frame(),
             section_offsets_m: Some(&offsets),
         };
-        let folder = staging.join("map");
-        std::fs::create_dir(&folder).map_err(cannot_write("map", &folder))?;
-        let mut sink = io::MapFolder::new(&folder);
-        done("map", map::draw(&input, &pipeline.map, &mut sink))
+        draw_map(pipeline, &input, staging)
     });
     let points = line.passing("points", |staging| {
         let (cloud, placed) = (cloud.get()?, placed.get()?);
@@ -147,8 +175,99 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
     chart.ensure()?;
     placed.ensure()?;
     points.ensure()?;
-    map.ensure()?;
-    report::finish(pipeline, &line, &folder, &input_hashes)
+    map.ensure()
+}
+
+/// From a mesh to a map of its surface; it enters at `cut`, its vertices stand for the points where some are needed.
+fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error> {
+    let raw = line.passing("ingest", |_| done("ingest", io::read_mesh(&pipeline.input[0])));
+    let axis = line.product("axis", |staging| {
+        let raw = raw.get()?;
+        let result = find_axis(pipeline, &raw.vertices, &raw.frame)?;
+        write_text("axis", &staging.join("axis.csv"), &axis_csv(&result.0, &raw.frame))?;
+        Ok(result)
+    });
+    let surface = line.product("mesh", |staging| {
+        let (raw, axis) = (raw.get()?, axis.get()?);
+        let observed = raw.observed.clone().unwrap_or_else(|| vec![true; raw.faces.len()]);
+        let mesh = Mesh::new(raw.vertices.clone(), raw.faces.clone(), observed).map_err(Error::in_stage("mesh"))?;
+        let axis: &Axis = &axis;
+        let coordinates: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
+        let section = SectionField::estimate(&coordinates, 0.0)
+            .map_err(|error| Error::in_stage("mesh")(segment::Error::from(error)))?;
+        write_ply("mesh", &staging.join("mesh.ply"), &raw.frame, &mesh, None)?;
+        let filled_m2: f64 = (0..mesh.faces().len())
+            .filter(|&f| !mesh.observed()[f])
+            .map(|f| mesh.double_area_vector(f as FaceId).norm() / 2.0)
+            .sum();
+        let summary = json!({
+            "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
+            "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
+        });
+        Ok((Surface { mesh, section }, summary))
+    });
+    let strip =
+        line.passing("cut", |_| done("cut", cut::open(surface.get()?.mesh.clone(), &*axis.get()?, &pipeline.cut)));
+    let chart = line.product("unwrap", |staging| {
+        let axis = axis.get()?;
+        let (chart, summary) = done("unwrap", unwrap::flatten(strip.take()?, Some(&axis), &pipeline.unwrap))?;
+        write_ply("unwrap", &staging.join("chart.ply"), &raw.get()?.frame, chart.strip().mesh(), Some(chart.uv()))?;
+        Ok((chart, summary))
+    });
+    let map = line.passing("map", |staging| {
+        let (chart, surface) = (chart.get()?, surface.get()?);
+        let offsets = section_offsets(chart.strip().mesh(), &*axis.get()?, &surface.section);
+        let frame = raw.get()?.frame.clone();
+        let input = map::DrawInput { chart: &chart, points: None, frame: &frame, section_offsets_m: Some(&offsets) };
+        draw_map(pipeline, &input, staging)
+    });
+    axis.ensure()?;
+    surface.ensure()?;
+    chart.ensure()?;
+    map.ensure()
+}
+
+/// Traces the axis, or reads the alignment that the settings name.
+fn find_axis(pipeline: &Pipeline, points: &[Vec3], frame: &ScanFrame) -> Result<(Axis, serde_json::Value), Error> {
+    let settings = pipeline.axis.in_local(frame);
+    match &settings.alignment {
+        Some(path) => {
+            let text = std::fs::read_to_string(path)
+                .map_err(|source| Error::in_stage("axis")(io::Error::Read { path: path.clone(), source }))?;
+            done("axis", axis::import_csv(&text, frame, &settings))
+        }
+        None => done("axis", axis::trace(points, &settings)),
+    }
+}
+
+/// Draws all layers and the overview into the folder `map` of the staging folder.
+fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Result<((), serde_json::Value), Error> {
+    let folder = staging.join("map");
+    std::fs::create_dir(&folder).map_err(cannot_write("map", &folder))?;
+    let mut sink = io::MapFolder::new(&folder);
+    let summary = map::draw(input, &pipeline.map, &mut sink).map_err(Error::in_stage("map"))?;
+    let picture = map::overview(input, &pipeline.map, &summary).map_err(Error::in_stage("map"))?;
+    io::write_picture(&folder.join("map.png"), &picture)
+        .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))?;
+    Ok(((), section(&summary)))
+}
+
+/// Whether the input is a mesh. Several files, one of them a mesh, make no sense together.
+fn is_mesh(inputs: &[PathBuf], settings: &io::Settings) -> Result<bool, Error> {
+    let extension = |p: &PathBuf| p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+    let mut meshes = 0;
+    for path in inputs {
+        meshes += usize::from(match extension(path).as_str() {
+            "obj" | "off" | "stl" | "glb" => true,
+            "ply" => io::inspect(path, settings).map_err(Error::in_stage("ingest"))?.faces > 0,
+            _ => false,
+        });
+    }
+    match (meshes, inputs.len()) {
+        (0, _) => Ok(false),
+        (1, 1) => Ok(true),
+        _ => Err(Error::SeveralMeshes { meshes, files: inputs.len() }),
+    }
 }
 
 /// Where the points of the scan lie on the map.
@@ -252,10 +371,20 @@ fn axis_csv(axis: &Axis, frame: &ScanFrame) -> String {
     text
 }
 
-fn write_ply(stage: &'static str, path: &Path, cloud: &Cloud, mesh: &Mesh, uv: Option<&[Vec2]>) -> Result<(), Error> {
+fn write_text(stage: &'static str, path: &Path, text: &str) -> Result<(), Error> {
+    std::fs::write(path, text).map_err(cannot_write(stage, path))
+}
+
+fn write_ply(
+    stage: &'static str,
+    path: &Path,
+    frame: &ScanFrame,
+    mesh: &Mesh,
+    uv: Option<&[Vec2]>,
+) -> Result<(), Error> {
     let observed = mesh.observed_vertices();
     let ply = PlyMesh {
-        frame: cloud.frame(),
+        frame,
         vertices: mesh.vertices(),
         uv,
         faces: mesh.faces(),

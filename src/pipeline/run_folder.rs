@@ -216,7 +216,11 @@ impl RunFolder {
     /// # Errors
     /// [`Error::Io`].
     pub fn write(&self, name: &str, content: &[u8]) -> Result<(), Error> {
-        write_atomically(&self.path.join(name), &self.path.join(PRIVATE).join(format!("tmp-{}", name.replace('/', "-"))), content)
+        write_atomically(
+            &self.path.join(name),
+            &self.path.join(PRIVATE).join(format!("tmp-{}", name.replace('/', "-"))),
+            content,
+        )
     }
 
     /// Where the checkpoint of a stage is.

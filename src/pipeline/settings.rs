@@ -15,7 +15,7 @@ use toml::de::{DeTable, DeValue};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pipeline {
-    /// Scan files, read together as one scan, or one mesh file; relative to the pipeline file.
+    /// Scan files, read together as one scan, or one mesh file; relative to the pipeline file, as all paths in it.
     #[serde(deserialize_with = "one_or_many")]
     pub input: Vec<PathBuf>,
     /// Reading the scan.
@@ -87,12 +87,12 @@ impl Pipeline {
     /// # Errors
     /// [`Error`] with line and column in the file, or the override that does not fit.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, Error> {
-        let text =
-            std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         let mut pipeline = Self::parse(&text, &path.display().to_string(), overrides)?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        for input in &mut pipeline.input {
-            *input = folder.join(&*input);
+        let more = [&mut pipeline.axis.alignment, &mut pipeline.ingest.poses];
+        for named in pipeline.input.iter_mut().chain(more.into_iter().flatten()) {
+            *named = folder.join(&*named);
         }
         pipeline.make_inputs_absolute();
         Ok(pipeline)
@@ -138,12 +138,15 @@ impl Pipeline {
     /// # Errors
     /// As [`Pipeline::load`].
     pub fn from_overrides(overrides: &[String]) -> Result<Self, Error> {
-        Self::parse("", "defaults", overrides)
+        let mut pipeline = Self::parse("", "defaults", overrides)?;
+        pipeline.make_inputs_absolute();
+        Ok(pipeline)
     }
 
     /// Replaces relative input paths by absolute ones, so that the resolved pipeline means the same everywhere.
     pub fn make_inputs_absolute(&mut self) {
-        for input in &mut self.input {
+        let more = [&mut self.axis.alignment, &mut self.ingest.poses];
+        for input in self.input.iter_mut().chain(more.into_iter().flatten()) {
             // Only an empty path or a vanished working folder has no absolute form; reading it will say so.
             if let Ok(absolute) = std::path::absolute(&*input) {
                 *input = absolute.components().collect();
