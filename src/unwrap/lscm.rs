@@ -35,11 +35,11 @@
 //! `A^T A`; the shift (1e-10 of the mean diagonal of `M`, boundary vertices only) makes it definite.
 //! Cost: one Cholesky factorization of twice the number of vertices, then one solve a round.
 
-use super::conformal::{ConformalForm, ShiftedForm, centre_unused, far_pair, used_vertices};
+use super::conformal::{ConformalForm, ShiftedForm, far_pair};
+use super::finish::finish;
 use super::guide::Guide;
 use super::rigid_fit::{chart_area, closest_rotations, conformal_energy, rotation_load};
 use super::triangle_shapes::Shapes;
-use super::unfold::unfold;
 use super::{Error, SolveSummary};
 use crate::cut::Strip;
 use crate::numeric::{Vec2, sparse};
@@ -129,27 +129,7 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     let scale = (shapes.area() / area).sqrt();
     uv.iter_mut().for_each(|p| *p *= scale);
     summary.energy = Some(conformal_energy(faces, &shapes.shapes, &uv));
-    let unfolded = unfold(strip.mesh(), &mut uv);
-    if unfolded.flipped_before > 0 {
-        summary.warnings.push(Warning::new(
-            "unfolded",
-            format!(
-                "{} faces were flipped by the conformal solve (obtuse or needle-shaped triangles); {} vertices were \
-                 moved to unfold them, {} faces stay flipped",
-                unfolded.flipped_before, unfolded.moved_vertices, unfolded.flipped_after
-            ),
-        ));
-    }
-    let unused = centre_unused(&used_vertices(uv.len(), faces), &mut uv);
-    for (name, count) in [
-        ("repaired_faces", shapes.repaired.len()),
-        ("unused_vertices", unused),
-        ("unfolded_faces", unfolded.flipped_before - unfolded.flipped_after),
-        ("unfolding_moved_vertices", unfolded.moved_vertices),
-    ] {
-        summary.figures.insert(name.to_owned(), count as f64);
-    }
-    summary.warnings.extend(shapes.warning());
+    finish(strip, &shapes, &mut uv, &mut summary);
     Ok((uv, summary))
 }
 

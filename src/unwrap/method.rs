@@ -151,4 +151,16 @@ methods! {
     Lscm(lscm) = "lscm", Similar;
     /// Relaxed section chart: nearly isometric, yet a chainage ruler. The default.
     Relax(relax) = "relax", Placed;
+    /// Angle based flattening by full Newton steps: the reference for small meshes.
+    Abf(abf) = "abf", Similar;
+    /// Angle based flattening by reduced Newton steps: least angle distortion.
+    AbfPlusPlus(abf_plus_plus) = "abf++", Similar;
+    /// As-rigid-as-possible map: lengths, areas and angles all nearly right.
+    Arap(arap) = "arap", Rigid;
+    /// Scalable locally injective map: never a flip, mild worst triangles.
+    Slim(slim) = "slim", Rigid;
+    /// As-rigid-as-possible deformation in space, then projection.
+    DeformArap(deform_arap) = "deform-arap", Rigid;
+    /// Bones that open the tunnel like a book, then projection.
+    DeformSkin(deform_skin) = "deform-skin", Rigid;
 }

@@ -3,17 +3,28 @@
 //! The map is seen from inside: u runs with the chainage, v is the girth from the crown, positive over the right wall
 //! (right when facing increasing chainage). Faces that run counter-clockwise seen from inside keep that sense in (u, v).
 
+pub mod abf;
+pub mod abf_plus_plus;
+mod angles;
+pub mod arap;
 mod conformal;
 pub mod chart_index;
+pub mod deform_arap;
+pub mod deform_skin;
 pub mod distortion;
+mod finish;
 pub mod guide;
 pub mod lscm;
 pub mod method;
+mod opening;
+mod poisson;
 pub mod readability;
 pub mod registration;
 pub mod relax;
 mod rigid_fit;
 pub mod section;
+pub mod slim;
+mod start;
 mod triangle_shapes;
 pub mod unfold;
 #[cfg(test)]

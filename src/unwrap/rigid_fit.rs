@@ -43,7 +43,6 @@ pub(super) fn rotation_load(
 
 /// Sum over faces of `area |J - R|^2`, with `R` the rotation closest to `J`: twice the energy of Liu et al. 2008 per
 /// unit of their weights, square metres.
-#[allow(dead_code, reason = "arap reads it")]
 pub(super) fn rigid_energy(faces: &[[u32; 3]], shapes: &[Shape], uv: &[Vec2]) -> f64 {
     let each: Vec<f64> = (faces, shapes)
         .into_par_iter()

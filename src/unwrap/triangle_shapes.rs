@@ -52,7 +52,6 @@ impl Shape {
     }
 
     /// Angles at the three corners, radians.
-    #[allow(dead_code, reason = "angle-based flattening reads it")]
     pub fn angles(&self) -> [f64; 3] {
         let Self { base, x, y } = *self;
         [y.atan2(x), y.atan2(base - x), (base * y).atan2(x * (x - base) + y * y)]
