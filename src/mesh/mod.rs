@@ -3,7 +3,6 @@
 pub mod reconstruct;
 pub mod repair;
 pub mod section;
-mod section_grid;
 pub mod anchor;
 pub mod nearest_face;
 pub mod surface_point;

@@ -22,11 +22,11 @@
 //! same bytes on any number of threads. Cost: linear in points and cells; 24 bytes a point and 60 a cell.
 
 use super::repair;
-use super::section_grid::{CellPoints, Grid, GridPoint, squared_distance};
 use super::{Mesh, VertexId};
 use crate::axis::Axis;
 use crate::numeric::{Mat3, Vec3, statistics};
 use crate::segment::Segmentation;
+use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint, squared_distance};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -35,7 +35,9 @@ const SPACING_IN_POINT_DISTANCES: f64 = 1.2;
 /// Default spacing is not finer than this share of the perimeter (4.4 cm in a rail tunnel).
 const FINEST_SHARE_OF_PERIMETER: f64 = 1.0 / 600.0;
 /// Longest side ratio of the cells of a profile scan.
-const MAX_CELL_ASPECT: f64 = 3.0;
+const MAX_CELL_ASPECT: f64 = 4.0;
+/// A profile scan tells less along the axis, so its cells are wider: this share of the perimeter.
+const FINEST_SHARE_OF_PROFILE: f64 = 1.0 / 400.0;
 /// Steepest slope of the depth, metres a metre, that still counts as the same surface.
 const MAX_SLOPE: f64 = 2.5;
 /// Scatter of points around the surface that is always allowed, metres.
@@ -48,6 +50,8 @@ const FIT_SIGMA: f64 = 0.7;
 const BUMP_POINTS: u32 = 2;
 /// How far a lonely point may stick out, in robust standard deviations of its neighbours.
 const BUMP_IN_SCALES: f64 = 5.0;
+/// A face between cells without points is observed when they are within this share of `max_gap_m` of one.
+const NEAR_SHARE: f64 = 0.6;
 /// Sweeps of the thin-plate fill; gaps of ten cells are smooth by then.
 const FILL_SWEEPS: usize = 60;
 
@@ -94,7 +98,9 @@ enum Node {
     Absent,
     /// Has points.
     Measured,
-    /// Close enough to points to count as observed.
+    /// Close to points: observed whatever its neighbours are.
+    Near,
+    /// Close enough to points to be observed together with a measured neighbour.
     Bridged,
     /// In a small hole.
     Filled,
@@ -142,7 +148,8 @@ fn choose_grid(segmentation: &Segmentation, options: &Options) -> (Grid, f64) {
     let even = (area / count as f64).sqrt();
     let column_m = options.spacing_m.unwrap_or_else(|| {
         let wanted = if sampling.is_profiles() { sampling.around_m } else { even } * SPACING_IN_POINT_DISTANCES;
-        wanted.max(section.mean_perimeter() * FINEST_SHARE_OF_PERIMETER)
+        let finest = if sampling.is_profiles() { FINEST_SHARE_OF_PROFILE } else { FINEST_SHARE_OF_PERIMETER };
+        wanted.max(section.mean_perimeter() * finest)
     });
     if !sampling.is_profiles() {
         return (Grid::new(section, column_m, column_m), options.max_gap_m.max(1.5 * column_m));
@@ -194,7 +201,7 @@ fn choose_clusters(grid: &Grid, cells: &CellPoints, summary: &mut Summary) -> Ve
                 return chosen;
             }
             let mut around: Vec<f64> =
-                neighbours(grid, cell, 2).map(|n| largest[n].0).filter(|c| c.count > 0).map(|c| c.middle).collect();
+                grid.neighbours(cell, 2).map(|n| largest[n].0).filter(|c| c.count > 0).map(|c| c.middle).collect();
             let Some(expected) = statistics::median(&mut around) else { return chosen };
             let fair = chosen.count.div_ceil(4);
             split(cell)
@@ -204,25 +211,6 @@ fn choose_clusters(grid: &Grid, cells: &CellPoints, summary: &mut Summary) -> Ve
                 .unwrap_or(chosen)
         })
         .collect()
-}
-
-/// The cells at most `reach` rows and columns away, the cell itself left out, in row order.
-fn neighbours(grid: &Grid, cell: usize, reach: usize) -> impl Iterator<Item = usize> + '_ {
-    let (i, j) = (cell / grid.columns, cell % grid.columns);
-    let rows = i.saturating_sub(reach)..(i + reach + 1).min(grid.rows);
-    let reach_around = reach.min((grid.columns - 1) / 2);
-    rows.flat_map(move |i| {
-        (0..2 * reach_around + 1).map(move |d| i * grid.columns + (j + grid.columns + d - reach_around) % grid.columns)
-    })
-    .filter(move |&n| n != cell)
-}
-
-/// Metres between the middles of two cells.
-fn distance(grid: &Grid, a: usize, b: usize) -> f64 {
-    let rows = (a / grid.columns).abs_diff(b / grid.columns) as f64;
-    let columns = (a % grid.columns).abs_diff(b % grid.columns);
-    let columns = columns.min(grid.columns - columns) as f64;
-    (rows * grid.row_m).hypot(columns * grid.column_m)
 }
 
 /// Empties cells that too few of their nearest occupied neighbours agree with.
@@ -236,9 +224,9 @@ fn drop_isolated(grid: &Grid, clusters: Vec<Cluster>, summary: &mut Summary) -> 
             }
             for reach in [1, 2, 4, 6] {
                 let (mut seen, mut agree) = (0, 0);
-                for n in neighbours(grid, cell, reach).filter(|&n| clusters[n].count > 0) {
+                for n in grid.neighbours(cell, reach).filter(|&n| clusters[n].count > 0) {
                     seen += 1;
-                    let allowed = MAX_SLOPE * distance(grid, cell, n) + NOISE_ALLOWANCE_M;
+                    let allowed = MAX_SLOPE * grid.distance(cell, n) + NOISE_ALLOWANCE_M;
                     let jump = (cluster.low - clusters[n].high).max(clusters[n].low - cluster.high);
                     agree += usize::from(jump <= allowed);
                 }
@@ -285,12 +273,12 @@ fn fit_depth(grid: &Grid, cells: &CellPoints, clusters: &[Cluster], cell: usize,
     let own = clusters[cell];
     // (row offset in cells, column offset in cells, depth, weight)
     let mut samples: Vec<[f64; 4]> = Vec::with_capacity(32);
-    for n in std::iter::once(cell).chain(neighbours(grid, cell, 1)) {
+    for n in std::iter::once(cell).chain(grid.neighbours(cell, 1)) {
         let cluster = clusters[n];
         if cluster.count == 0 {
             continue;
         }
-        let allowed = MAX_SLOPE * distance(grid, cell, n) + NOISE_ALLOWANCE_M;
+        let allowed = MAX_SLOPE * grid.distance(cell, n) + NOISE_ALLOWANCE_M;
         if (own.low - cluster.high).max(cluster.low - own.high) > allowed {
             continue;
         }
@@ -329,7 +317,7 @@ fn drop_bumps(grid: &Grid, clusters: Vec<Cluster>, places: &[GridPoint], summary
             }
             let here = places[cell];
             let mut samples: Vec<[f64; 4]> = Vec::with_capacity(24);
-            for n in neighbours(grid, cell, 2).filter(|&n| clusters[n].count > 0) {
+            for n in grid.neighbours(cell, 2).filter(|&n| clusters[n].count > 0) {
                 let dr = places[n].row - here.row;
                 let mut dc = places[n].column - here.column;
                 dc -= grid.columns as f64 * (dc / grid.columns as f64).round();
@@ -410,6 +398,7 @@ fn support(
                 return Node::Measured;
             }
             let (i, j) = (cell / grid.columns, cell % grid.columns);
+            let mut nearest = f64::INFINITY;
             for other in i.saturating_sub(reach_rows)..(i + reach_rows + 1).min(grid.rows) {
                 for d in 0..2 * reach_columns + 1 {
                     let n = other * grid.columns + (j + grid.columns + d - reach_columns) % grid.columns;
@@ -420,12 +409,14 @@ fn support(
                     // The place's shift inside its cell, on top of whole columns.
                     let shift = places[n].column - (n % grid.columns) as f64 - 0.5;
                     let dc = (d as f64 - reach_columns as f64 + shift) * grid.column_m / around_gap;
-                    if dr * dr + dc * dc <= 1.0 {
-                        return Node::Bridged;
-                    }
+                    nearest = nearest.min(dr * dr + dc * dc);
                 }
             }
-            Node::Absent
+            match nearest {
+                d if d <= NEAR_SHARE * NEAR_SHARE => Node::Near,
+                d if d <= 1.0 => Node::Bridged,
+                _ => Node::Absent,
+            }
         })
         .collect();
     // Closing: grow the surface by half the hole width, then shrink it back; what stays beyond was a narrow hole.
@@ -448,7 +439,7 @@ fn support(
             }
         }
     }
-    summary.cells_bridged = state.iter().filter(|s| **s == Node::Bridged).count();
+    summary.cells_bridged = state.iter().filter(|s| matches!(s, Node::Near | Node::Bridged)).count();
     summary.cells_filled = state.iter().filter(|s| **s == Node::Filled).count();
     state
 }
@@ -459,7 +450,8 @@ fn fill_depths(grid: &Grid, state: &[Node], places: &mut [GridPoint]) {
     let columns = grid.columns;
     // Round in which a node got its first value.
     let mut known: Vec<u32> = state.iter().map(|s| if *s == Node::Measured { 0 } else { UNKNOWN }).collect();
-    let mut front: Vec<usize> = (0..grid.len()).filter(|&n| matches!(state[n], Node::Bridged | Node::Filled)).collect();
+    let mut front: Vec<usize> =
+        (0..grid.len()).filter(|&n| matches!(state[n], Node::Near | Node::Bridged | Node::Filled)).collect();
     let unknown = front.clone();
     let mut round = 0;
     while !front.is_empty() {
@@ -468,8 +460,8 @@ fn fill_depths(grid: &Grid, state: &[Node], places: &mut [GridPoint]) {
         let mut reached = Vec::new();
         for &n in &front {
             let (mut sum, mut weight) = (0.0, 0.0);
-            for m in neighbours(grid, n, 1).filter(|&m| known[m] < round) {
-                let w = 1.0 / distance(grid, n, m).powi(2);
+            for m in grid.neighbours(n, 1).filter(|&m| known[m] < round) {
+                let w = 1.0 / grid.distance(n, m).powi(2);
                 sum += w * places[m].depth;
                 weight += w;
             }
@@ -571,9 +563,10 @@ fn triangulate(
                 ];
                 let mut add = |corners: [usize; 3]| {
                     if corners.iter().all(|&n| id[n] != VertexId::MAX) {
-                        let measured = corners.iter().filter(|&&n| state[n] == Node::Measured).count();
                         let filled = corners.iter().any(|&n| state[n] == Node::Filled);
-                        out.push((corners.map(|n| id[n]), !filled && (measured > 0 || profiles)));
+                        let measured = corners.iter().any(|&n| state[n] == Node::Measured);
+                        let near = corners.iter().all(|&n| state[n] == Node::Near);
+                        out.push((corners.map(|n| id[n]), !filled && (measured || near || profiles)));
                     }
                 };
                 let missing = square.iter().filter(|&&n| id[n] == VertexId::MAX).count();

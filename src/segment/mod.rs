@@ -1,8 +1,12 @@
 //! Which points are wall: the mean section along the axis, and what does not belong to it.
 
+pub mod floor;
 pub mod sampling;
 pub mod section_field;
+pub mod surfaces;
+pub(crate) mod unrolled_grid;
 
+pub use floor::Floor;
 pub use sampling::Sampling;
 pub use section_field::SectionField;
 
@@ -12,6 +16,12 @@ use crate::warning::Warning;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use unrolled_grid::{CellPoints, Grid};
+
+/// Edge of a cell of the depth picture in distances between points.
+const POINT_DISTANCES_A_CELL: f64 = 2.5;
+/// Cells of the depth picture are not finer than this share of the perimeter (5 cm in a rail tunnel).
+const FINEST_SHARE_OF_PERIMETER: f64 = 1.0 / 500.0;
 
 /// What a point belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -44,7 +54,7 @@ impl Class {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Points farther than this from the mean section are outside, metres; by default 0.4 of the local mean radius,
+    /// Points farther than this behind the mean section are outside, metres; by default 0.4 of the local mean radius,
     /// at least 0.15 m.
     pub max_offset_m: Option<f64>,
 }
@@ -60,6 +70,8 @@ pub struct Segmentation {
     pub section: SectionField,
     /// How densely the surface was sampled.
     pub sampling: Sampling,
+    /// The feet of the walls, when the tunnel has a floor.
+    pub floor: Option<Floor>,
 }
 
 /// What was found, for the report.
@@ -77,6 +89,10 @@ pub struct Summary {
     pub bridged_percent: f64,
     /// How densely the surface was sampled.
     pub sampling: Sampling,
+    /// Pieces of connected surface in the depth picture.
+    pub patches: surfaces::PatchCounts,
+    /// Whether a level floor was found.
+    pub has_floor: bool,
     /// What a person should know.
     pub warnings: Vec<Warning>,
 }
@@ -117,15 +133,51 @@ pub fn classify_positions(
     } else {
         first
     };
-    let class: Vec<Class> = coordinates
+    let mut class: Vec<Class> = coordinates
         .par_iter()
         .map(|c| {
-            let radius = section.radius(c.chainage, c.angle());
+            // A duct all along the tunnel dents the mean section; what lies behind it is still wall.
+            let radius = [-0.35, -0.17, 0.0, 0.17, 0.35]
+                .iter()
+                .map(|turn| section.radius(c.chainage, c.angle() + turn))
+                .fold(0.0, f64::max);
             let limit = settings.max_offset_m.unwrap_or((0.4 * radius).max(0.15));
             let beyond = c.chainage < section.start() || c.chainage > section.end();
-            if beyond || (c.radius() - radius).abs() > limit { Class::Outside } else { Class::Wall }
+            // Points near the axis may be furniture; only those far behind the wall are surely outside.
+            if beyond || c.radius() - radius > limit { Class::Outside } else { Class::Noise }
         })
         .collect();
+    let spacing = if sampling.is_profiles() { sampling.around_m } else { sampling.around_m.max(sampling.along_m) };
+    let column_m = (POINT_DISTANCES_A_CELL * spacing).max(section.mean_perimeter() * FINEST_SHARE_OF_PERIMETER);
+    let row_m = if sampling.is_profiles() { sampling.along_m.max(column_m) } else { column_m };
+    let grid = Grid::new(&section, row_m, column_m);
+    let (cells, _) = CellPoints::sort(
+        &grid,
+        coordinates.par_iter().zip(&class).map(|(c, k)| (*k != Class::Outside).then(|| grid.unroll(&section, c))),
+    );
+    let mean_radius = section.mean_perimeter() / std::f64::consts::TAU;
+    let (patches, depth) = surfaces::classify(&grid, &cells, &section, mean_radius, &mut class);
+    drop(cells);
+    let floor = if axis.is_shaft() { None } else { floor::find(&grid, &section, &depth) };
+    if let Some(floor) = &floor {
+        class.par_iter_mut().zip(&coordinates).for_each(|(k, c)| {
+            if *k == Class::Wall && floor.contains(c.chainage, section.girth(c.chainage, c.angle())) {
+                *k = Class::Floor;
+            }
+        });
+    }
+    // Once more without the furniture: a duct must not lengthen the girth of the wall behind it.
+    let surface: Vec<AxisCoordinates> =
+        coordinates.iter().zip(&class).filter(|(_, k)| k.is_surface()).map(|(c, _)| *c).collect();
+    let cleared = SectionField::estimate(&surface, if sampling.is_profiles() { sampling.along_m } else { 0.0 })?;
+    drop(surface);
+    let floor = floor.map(|f| f.on(&section, &cleared));
+    let section = cleared;
+    class.par_iter_mut().zip(&coordinates).for_each(|(k, c)| {
+        if k.is_surface() && (c.chainage < section.start() || c.chainage > section.end()) {
+            *k = Class::Outside;
+        }
+    });
     let summary = Summary {
         points_by_class: Class::ALL.map(|k| (k, class.iter().filter(|&&c| c == k).count())).to_vec(),
         start_chainage_m: section.start(),
@@ -133,7 +185,61 @@ pub fn classify_positions(
         mean_perimeter_m: section.mean_perimeter(),
         bridged_percent: 100.0 * section.bridged_share(),
         sampling,
+        patches,
+        has_floor: floor.is_some(),
         warnings: Vec::new(),
     };
-    Ok((Segmentation { class, coordinates, section, sampling }, summary))
+    Ok((Segmentation { class, coordinates, section, sampling, floor }, summary))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clean::{self, DROPPED};
+    use crate::synthetic::{Alignment, Item, ScanPlan, Section, Surface, Tunnel, scan};
+
+    /// Precision and recall of `found` for the points that truly are `surface`.
+    fn score(truth: &[Surface], class: &[Class], surface: Surface, found: Class) -> (f64, f64) {
+        let both = truth.iter().zip(class).filter(|(t, c)| **t == surface && **c == found).count() as f64;
+        let claimed = class.iter().filter(|c| **c == found).count() as f64;
+        let real = truth.iter().filter(|t| **t == surface).count() as f64;
+        (both / claimed, both / real)
+    }
+
+    #[test]
+    fn a_drift_full_of_things_is_told_apart() {
+        let length = 20.0;
+        let mut tunnel = Tunnel::rock_drift(Section::horseshoe(5.0, 4.8), Alignment::bend(length, 60.0), 0.1, 3);
+        // The axis of a horseshoe runs at half height.
+        let floor = -2.4;
+        tunnel.furniture = vec![Item::duct(length, 1.2, 1.3, 0.35), Item::cable(length, -2.2, 0.9)];
+        tunnel.furniture.extend(Item::rails(length, 1.435, floor));
+        tunnel.furniture.extend(Item::vehicle(11.0, -0.8, floor));
+        let plan = ScanPlan { points: 400_000, range_noise_m: 0.003, outlier_share: 0.005, ..ScanPlan::default() };
+        let scan = scan(&tunnel, &plan).unwrap();
+        let (geometry, _) = clean::clean(&scan.cloud, &clean::Settings::default()).unwrap();
+        let (segmentation, summary) =
+            classify_positions(geometry.positions(), &tunnel.axis(), &Settings::default()).unwrap();
+        let class: Vec<Class> = geometry
+            .geometry_of_point()
+            .iter()
+            .map(|&g| if g == DROPPED { Class::Noise } else { segmentation.class[g as usize] })
+            .collect();
+        let wall = score(&scan.truth.surface, &class, Surface::Wall, Class::Wall);
+        let floor = score(&scan.truth.surface, &class, Surface::Floor, Class::Floor);
+        assert!(wall.0 > 0.98 && wall.1 > 0.97, "wall {wall:?} {summary:?}");
+        assert!(floor.0 > 0.95 && floor.1 > 0.95, "floor {floor:?} {summary:?}");
+        assert!(summary.has_floor && summary.patches.furniture_patches > 0);
+    }
+
+    #[test]
+    fn a_round_pipe_has_no_floor() {
+        let tunnel = Tunnel::smooth(Section::circle(0.45), Alignment::straight(8.0));
+        let scan = scan(&tunnel, &ScanPlan { points: 40_000, ..ScanPlan::default() }).unwrap();
+        let (segmentation, summary) =
+            classify_positions(scan.cloud.positions(), &tunnel.axis(), &Settings::default()).unwrap();
+        assert!(!summary.has_floor && segmentation.floor.is_none());
+        let wall = segmentation.class.iter().filter(|c| **c == Class::Wall).count();
+        assert!(wall as f64 > 0.99 * segmentation.class.len() as f64, "{summary:?}");
+    }
 }

@@ -33,7 +33,7 @@ const SIGMA_S_IN_RADII: f64 = 0.35;
 /// Smoothing around the section, radians (3 degrees: the corner between wall and floor is rounded by about 0.2 m).
 const SIGMA_ANGLE: f64 = 3.0 * PI / 180.0;
 /// A cell farther from the median of its neighbourhood than this share of the radius is not part of the mean section.
-const REJECT_SHARE: f64 = 0.3;
+const REJECT_SHARE: f64 = 0.2;
 /// Rows looked at on both sides for that median: 8 m of a rail tunnel, so that 7 m beyond a portal are outvoted.
 const REJECT_ROWS: usize = 16;
 /// A row belongs to the tunnel when at least this share of its 10-degree sectors holds points.
@@ -52,6 +52,9 @@ pub struct SectionField {
     /// `rows x (COLUMNS + 1)`: girth at the same angles, closing at `+pi`.
     girth: Vec<f64>,
 }
+
+/// The tunnel ends where fewer directions than this share of the usual number agree with the section further inside.
+const PORTAL_SHARE: f64 = 0.7;
 
 /// Why no mean section was found.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -90,10 +93,14 @@ impl SectionField {
         let step = (mean_radius * STEP_IN_RADII).max(min_step_m).max((high - low) / 1e6);
         let rows = ((high - low) / step).ceil().max(1.0) as usize;
         let raw = raw_medians(points, low, step, rows);
-        let (first, last) = tunnel_rows(&raw, rows)?;
-        let (start, rows) = (low + first as f64 * step, last - first + 1);
-        let mut raw = raw[first * COLUMNS / MEDIAN_COLUMNS..(last + 1) * COLUMNS / MEDIAN_COLUMNS].to_vec();
-        reject_isolated(&mut raw, rows);
+        let columns = COLUMNS / MEDIAN_COLUMNS;
+        let (first, last) = tunnel_rows(&raw, rows, 0.0)?;
+        let mut raw = raw[first * columns..(last + 1) * columns].to_vec();
+        reject_isolated(&mut raw, last - first + 1);
+        // What was rejected at the ends lies outside the portals.
+        let (inner_first, inner_last) = tunnel_rows(&raw, last - first + 1, PORTAL_SHARE)?;
+        let (start, rows) = (low + (first + inner_first) as f64 * step, inner_last - inner_first + 1);
+        let raw = raw[inner_first * columns..(inner_last + 1) * columns].to_vec();
         let (radius, observed) = smooth(&raw, rows, (mean_radius * SIGMA_S_IN_RADII / step).max(0.7), mean_radius);
         Ok(Self::from_radii(start, step, rows, radius, observed))
     }
@@ -298,8 +305,9 @@ fn raw_medians(points: &[AxisCoordinates], low: f64, step: f64, rows: usize) -> 
         .collect()
 }
 
-/// First and last row that look like a tunnel: enough directions hold points.
-fn tunnel_rows(raw: &[f64], rows: usize) -> Result<(usize, usize), Error> {
+/// First and last row that look like a tunnel: enough directions hold points, and at least `typical` of what the median
+/// row has.
+fn tunnel_rows(raw: &[f64], rows: usize, typical: f64) -> Result<(usize, usize), Error> {
     const SECTORS: usize = 36;
     let columns = COLUMNS / MEDIAN_COLUMNS;
     let share = |row: usize| {
@@ -310,8 +318,9 @@ fn tunnel_rows(raw: &[f64], rows: usize) -> Result<(usize, usize), Error> {
         seen.iter().filter(|s| **s).count() as f64 / SECTORS as f64
     };
     let shares: Vec<f64> = (0..rows).map(share).collect();
-    let first = shares.iter().position(|&s| s >= MIN_SECTOR_SHARE);
-    let last = shares.iter().rposition(|&s| s >= MIN_SECTOR_SHARE);
+    let wanted = MIN_SECTOR_SHARE.max(typical * statistics::median(&mut shares.clone()).unwrap_or(0.0));
+    let first = shares.iter().position(|&s| s >= wanted);
+    let last = shares.iter().rposition(|&s| s >= wanted);
     match (first, last) {
         (Some(first), Some(last)) => Ok((first, last)),
         _ => Err(Error::NotSurrounded { percent: 100.0 * shares.iter().copied().fold(0.0, f64::max) }),

@@ -1,17 +1,17 @@
-//! The unrolled grid of the section method: rows along the chainage, columns around the mean section.
+//! The unrolled grid that segmentation and the section method work on: rows along the chainage, columns around the mean section.
 //!
 //! Column positions are shares of the local perimeter, so the grid closes at the invert at every chainage and the cells
 //! grow and shrink with the section. Depth is the signed distance from the mean section along the ray from the axis,
 //! positive away from the axis.
 
+use super::SectionField;
 use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::Vec3;
-use crate::segment::SectionField;
 use rayon::prelude::*;
 
 /// Where a point lies on the grid: rows and columns are real numbers, cell `(i, j)` covers `i..i+1`, `j..j+1`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct GridPoint {
+pub(crate) struct GridPoint {
     pub row: f64,
     pub column: f64,
     /// Metres behind the mean section (negative: in front of it).
@@ -20,7 +20,7 @@ pub(super) struct GridPoint {
 
 /// Size and place of the grid.
 #[derive(Clone, Debug)]
-pub(super) struct Grid {
+pub(crate) struct Grid {
     pub start: f64,
     /// Row length in metres of chainage.
     pub row_m: f64,
@@ -48,6 +48,25 @@ impl Grid {
         self.rows * self.columns
     }
 
+    /// The cells at most `reach` rows and columns away, the cell itself left out, in row order.
+    pub fn neighbours(&self, cell: usize, reach: usize) -> impl Iterator<Item = usize> + '_ {
+        let (i, j) = (cell / self.columns, cell % self.columns);
+        let rows = i.saturating_sub(reach)..(i + reach + 1).min(self.rows);
+        let around = reach.min((self.columns - 1) / 2);
+        rows.flat_map(move |i| {
+            (0..2 * around + 1).map(move |d| i * self.columns + (j + self.columns + d - around) % self.columns)
+        })
+        .filter(move |&n| n != cell)
+    }
+
+    /// Metres between the middles of two cells.
+    pub fn distance(&self, a: usize, b: usize) -> f64 {
+        let rows = (a / self.columns).abs_diff(b / self.columns) as f64;
+        let columns = (a % self.columns).abs_diff(b % self.columns);
+        let columns = columns.min(self.columns - columns) as f64;
+        (rows * self.row_m).hypot(columns * self.column_m)
+    }
+
     /// The grid coordinates of a point; the row may lie outside the grid.
     pub fn unroll(&self, section: &SectionField, c: &AxisCoordinates) -> GridPoint {
         let angle = c.angle();
@@ -72,10 +91,12 @@ impl Grid {
 }
 
 /// Points sorted by the grid cell they lie in.
-pub(super) struct CellPoints {
+pub(crate) struct CellPoints {
     /// First point of each cell, one more than there are cells.
     first: Vec<u32>,
     points: Vec<GridPoint>,
+    /// Index of each point in the input.
+    index: Vec<u32>,
 }
 
 impl CellPoints {
@@ -98,16 +119,24 @@ impl CellPoints {
         }
         let mut cursor = first.clone();
         let mut points = vec![GridPoint { row: 0.0, column: 0.0, depth: 0.0 }; first[grid.len()] as usize];
-        for p in unrolled.iter().flatten().filter(|p| inside(p)) {
+        let mut index = vec![0u32; points.len()];
+        for (i, p) in unrolled.iter().enumerate().filter_map(|(i, p)| p.as_ref().filter(|p| inside(p)).map(|p| (i, p)))
+        {
             let slot = &mut cursor[cell(p)];
             points[*slot as usize] = *p;
+            index[*slot as usize] = i as u32;
             *slot += 1;
         }
-        (Self { first, points }, left_out)
+        (Self { first, points, index }, left_out)
     }
 
     pub fn in_cell(&self, cell: usize) -> &[GridPoint] {
         &self.points[self.first[cell] as usize..self.first[cell + 1] as usize]
+    }
+
+    /// Input indices of the points of [`Self::in_cell`].
+    pub fn indices_in_cell(&self, cell: usize) -> &[u32] {
+        &self.index[self.first[cell] as usize..self.first[cell + 1] as usize]
     }
 
     pub fn len(&self) -> usize {
@@ -120,7 +149,7 @@ impl CellPoints {
 ///
 /// Reference: P. F. Felzenszwalb, D. P. Huttenlocher, "Distance transforms of sampled functions", Theory of Computing 8,
 /// 2012, doi:10.4086/toc.2012.v008a019.
-pub(super) fn squared_distance(marked: &[bool], rows: usize, columns: usize, scale: [f64; 2]) -> Vec<f64> {
+pub(crate) fn squared_distance(marked: &[bool], rows: usize, columns: usize, scale: [f64; 2]) -> Vec<f64> {
     // Around: each row is repeated half a turn on both sides.
     let half = columns / 2 + 1;
     let mut field: Vec<f64> = vec![0.0; rows * columns];
