@@ -181,17 +181,14 @@ fn lettering_reads_correctly_from_inside() {
     let folder = run(&scan, "run", &["--set", "map.cell_m=0.02"]);
     let picture = Picture::open(&folder, "color");
     // The crown is in the middle.
-    let (top, bottom) =
-        (picture.v_of_first, picture.v_of_first - f64::from(picture.pixels.height()) * picture.cell_m);
+    let (top, bottom) = (picture.v_of_first, picture.v_of_first - f64::from(picture.pixels.height()) * picture.cell_m);
     assert!((top + bottom).abs() < 0.3, "v runs from {bottom} to {top}");
     for letters in &tunnel.lettering {
         let sign = if letters.wall == Wall::Left { -1.0 } else { 1.0 };
         let (s0, g0) = (letters.chainage_m, sign * letters.girth_m);
         let (half_width, half_height) = (letters.width_m() / 2.0 + 0.1, letters.height_m / 2.0 + 0.1);
-        let window: Vec<_> = picture
-            .places()
-            .filter(|(u, v, _)| (u - s0).abs() < half_width && (v - g0).abs() < half_height)
-            .collect();
+        let window: Vec<_> =
+            picture.places().filter(|(u, v, _)| (u - s0).abs() < half_width && (v - g0).abs() < half_height).collect();
         assert!(window.len() > 500, "the lettering {} is on the map", letters.text);
         // How much brighter the paint is than the rock around it, were the map as `seen` says.
         let contrast = |seen: &dyn Fn(f64, f64) -> (f64, f64)| {
@@ -220,7 +217,8 @@ fn labels_survive_the_way_to_the_map_and_back() {
     let (scan, _) = lettered(temporary.path());
     let folder = run(&scan, "run", &["--set", "map.cell_m=0.005"]);
     let lifted = temporary.path().join("lifted.laz");
-    let output = adit(&["lift", path(&folder), "--labels", path(&folder.join("map/labels.png")), "--out", path(&lifted)]);
+    let output =
+        adit(&["lift", path(&folder), "--labels", path(&folder.join("map/labels.png")), "--out", path(&lifted)]);
     assert!(output.status.success(), "{}", text(&output));
     let before: Vec<u32> = las::Reader::from_path(&scan)
         .unwrap()
