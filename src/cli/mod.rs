@@ -3,9 +3,11 @@
 //! A subcommand is a module with `Arguments` (clap) and `fn run(arguments, &Console) -> Result`. To add one: a `mod` line,
 //! a variant of [`Command`] whose doc comment is its one-line help, and an arm in [`Command::run`].
 
+mod compare_methods;
 mod console;
 mod exit;
 mod info;
+mod measure;
 mod run;
 mod unwrap;
 mod synth;
@@ -27,6 +29,10 @@ enum Command {
     Unwrap(unwrap::Arguments),
     /// Make a synthetic scan of a tunnel that is known in closed form.
     Synth(synth::Arguments),
+    /// Flatten one mesh with every method and compare the maps.
+    CompareMethods(compare_methods::Arguments),
+    /// Measure on the map and on the surface under it.
+    Measure(measure::Arguments),
 }
 
 impl Command {
@@ -36,6 +42,8 @@ impl Command {
             Command::Info(arguments) => info::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),
             Command::Synth(arguments) => synth::run(arguments, console),
+            Command::CompareMethods(arguments) => compare_methods::run(arguments, console),
+            Command::Measure(arguments) => measure::run(arguments, console),
         }
     }
 }

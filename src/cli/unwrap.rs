@@ -39,6 +39,9 @@ pub struct Arguments {
     /// The tunnel axis as CSV in scan coordinates. Without it the axis is traced when the method needs one.
     #[arg(long, value_name = "AXIS.csv")]
     axis: Option<PathBuf>,
+    /// Trace the axis even if the method can do without, to place the map and tell its readability.
+    #[arg(long)]
+    place_by_axis: bool,
     /// Print distortion, readability and timings as JSON.
     #[arg(long)]
     json: bool,
@@ -90,6 +93,9 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         report["seconds"] = serde_json::json!({
             "read": read_seconds, "open": open_seconds, "flatten": flatten_seconds, "all": seconds
         });
+        if let Some(peak) = peak_memory_mib() {
+            report["peak_memory_mib"] = peak.into();
+        }
         console.print(&format!("{report:#}"));
     } else {
         console.print(&lines(&summary, mesh.faces().len(), seconds));
@@ -134,7 +140,7 @@ fn open(
             let read = axis::import_csv(&text, frame, &axis::Settings::default());
             Some(read.with_context(|| path.display().to_string()).map_err(bad)?.0)
         }
-        None if settings.method.needs_axis() || is_tube(&mesh) => {
+        None if arguments.place_by_axis || settings.method.needs_axis() || is_tube(&mesh) => {
             let traced = axis::trace(mesh.vertices(), &axis::Settings::default());
             let what = || format!("{name} shows no tunnel axis, which '{}' needs", settings.method.name());
             Some(traced.with_context(what).map_err(bad)?.0)
@@ -161,6 +167,13 @@ fn is_tube(mesh: &Mesh) -> bool {
         .collect();
     lengths.sort_by(|a, b| b.total_cmp(a));
     matches!(lengths[..], [first, second, ..] if second > SECOND_PORTAL * first)
+}
+
+/// Largest memory of this process so far, where the system tells (Linux).
+fn peak_memory_mib() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    Some((line.trim().trim_end_matches("kB").trim().parse::<f64>().ok()? / 1024.0).round())
 }
 
 /// Writes under a temporary name first, so that a killed process leaves no half a file under the final one.

@@ -14,7 +14,7 @@ mod overview;
 mod rasterize;
 mod relief;
 mod sampling;
-mod stroke_font;
+pub(crate) mod stroke_font;
 
 #[cfg(test)]
 pub(crate) mod example;

@@ -12,7 +12,7 @@ use nalgebra::{Rotation3, Unit};
 const SAME_M: f64 = 2e-5;
 
 fn chart(method: &str, strip: Strip, axis: &Axis) -> (Chart, Summary) {
-    let settings = Settings { smoothing_m: 0.0, ..Settings::of(Method::named(method).unwrap()) };
+    let settings = Settings { smoothing_m: Some(0.0), ..Settings::of(Method::named(method).unwrap()) };
     flatten(strip, Some(axis), &settings).unwrap_or_else(|e| panic!("{method}: {e}"))
 }
 

@@ -149,13 +149,15 @@ pub struct Settings {
     /// The method. Default `relax`.
     pub method: Method,
     /// Distortion is told twice: against the mesh itself, and against the surface smoothed over this distance in
-    /// metres, which is what the reader of the map cares about. 0 leaves the second out. Default 0.25.
-    pub smoothing_m: f64,
+    /// metres, which is what the reader of the map cares about. 0 leaves the second out. Chosen automatically when not
+    /// given: 0.25, or a sixtieth of the girth in narrow tubes.
+    pub smoothing_m: Option<f64>,
 }
 
-/// Distance over which the surface is smoothed for the second distortion, metres: larger than joints and drill marks,
-/// smaller than the section.
+/// Distance over which the surface is smoothed for the second distortion, metres: larger than joints and drill marks.
 const SMOOTHING_M: f64 = 0.25;
+/// At most this share of the girth is smoothed, so that a narrow tube does not shrink.
+const SMOOTHING_OF_GIRTH: f64 = 1.0 / 60.0;
 
 impl Default for Settings {
     fn default() -> Self {
@@ -166,14 +168,16 @@ impl Default for Settings {
 impl Settings {
     /// A method with the default way of telling its distortion.
     pub fn of(method: Method) -> Self {
-        Self { method, smoothing_m: SMOOTHING_M }
+        Self { method, smoothing_m: None }
     }
 }
 
 impl Serialize for Settings {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(2))?;
-        map.serialize_entry("smoothing_m", &self.smoothing_m)?;
+        let mut map = serializer.serialize_map(None)?;
+        if let Some(smoothing_m) = self.smoothing_m {
+            map.serialize_entry("smoothing_m", &smoothing_m)?;
+        }
         self.method.serialize_entry(&mut map)?;
         map.end()
     }
@@ -198,7 +202,7 @@ impl<'de> Deserialize<'de> for Settings {
                 let mut chosen: Option<String> = None;
                 while let Some(key) = map.next_key::<String>()? {
                     if key == "smoothing_m" {
-                        settings.smoothing_m = map.next_value()?;
+                        settings.smoothing_m = Some(map.next_value()?);
                     } else if let Some(first) = &chosen {
                         return Err(A::Error::custom(method::two_methods(first, &key)));
                     } else {
@@ -223,8 +227,8 @@ impl JsonSchema for Settings {
         properties.insert(
             "smoothing_m".to_owned(),
             serde_json::json!({
-                "type": "number", "minimum": 0.0, "default": SMOOTHING_M,
-                "description": "Distortion is also told against the surface smoothed over this distance; 0 leaves it out."
+                "type": "number", "minimum": 0.0,
+                "description": "Distortion is also told against the surface smoothed over this distance in metres; 0 leaves it out. Chosen automatically when not given: 0.25, or a sixtieth of the girth in narrow tubes."
             }),
         );
         let mut one_of = Vec::new();
@@ -305,8 +309,8 @@ pub struct Summary {
 /// [`Error::NeedsAxis`] for methods that cannot do without, [`Error::NotOpened`] for strips that wind around the axis,
 /// and what the method itself refuses.
 pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result<(Chart, Summary), Error> {
-    if !(settings.smoothing_m >= 0.0 && settings.smoothing_m.is_finite()) {
-        return Err(Error::Setting { key: "smoothing_m", value: settings.smoothing_m, must: "0 or more metres" });
+    if let Some(value) = settings.smoothing_m.filter(|s| !(*s >= 0.0 && s.is_finite())) {
+        return Err(Error::Setting { key: "smoothing_m", value, must: "0 or more metres" });
     }
     let section_settings = match &settings.method {
         Method::Section(own) => own.clone(),
@@ -323,8 +327,12 @@ pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result
     if let Some(guide) = &guide {
         warnings.extend(guide.summary().warnings.iter().cloned());
     }
-    let smoothed = (settings.smoothing_m > 0.0)
-        .then(|| Distortion::of(&distortion::smoothed_surface(mesh, settings.smoothing_m), chart.uv()));
+    let smoothing_m = settings.smoothing_m.unwrap_or_else(|| {
+        let girth = guide.as_ref().map_or_else(|| mesh.area().sqrt(), |g| g.summary().section.mean_girth_m);
+        SMOOTHING_M.min(girth * SMOOTHING_OF_GIRTH)
+    });
+    let smoothed =
+        (smoothing_m > 0.0).then(|| Distortion::of(&distortion::smoothed_surface(mesh, smoothing_m), chart.uv()));
     let summary = Summary {
         method: settings.method.name().to_owned(),
         flipped_faces,
@@ -332,7 +340,7 @@ pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result
         overlaps: distortion::border_crossings(chart.strip(), chart.uv()),
         distortion: Distortion::of(mesh, chart.uv()),
         smoothed,
-        smoothing_m: settings.smoothing_m,
+        smoothing_m,
         readability: guide.as_ref().map(|guide| Readability::of(mesh, chart.uv(), guide)),
         registration: placement,
         guide: guide.map(|g| g.summary().clone()),
@@ -359,7 +367,7 @@ mod tests {
     fn a_method_is_a_table_or_a_name() {
         assert_eq!(parse("unwrap = \"section\"").unwrap(), Settings::of(Method::named("section").unwrap()));
         let settings = parse("[unwrap]\nsmoothing_m = 0.5\n[unwrap.section]\nwindow_m = 3").unwrap();
-        assert_eq!(settings.smoothing_m, 0.5);
+        assert_eq!(settings.smoothing_m, Some(0.5));
         assert_eq!(settings.method, Method::Section(section::Settings { window_m: 3.0 }));
         assert_eq!(parse("[unwrap]").unwrap(), Settings::default());
     }
