@@ -6,6 +6,7 @@
 mod compare_methods;
 mod console;
 mod exit;
+mod explain;
 mod info;
 mod measure;
 mod run;
@@ -23,6 +24,8 @@ use std::process::ExitCode;
 enum Command {
     /// Turn a tunnel scan into a flat, metric map (the whole pipeline).
     Run(run::Arguments),
+    /// Tell which stages of a run are up to date, and why the others are not.
+    Explain(explain::Arguments),
     /// Tell what is in a scan or mesh file, and what is suspicious about it.
     Info(info::Arguments),
     /// Flatten one mesh.
@@ -39,6 +42,7 @@ impl Command {
     fn run(self, console: &Console) -> Result {
         match self {
             Command::Run(arguments) => run::run(arguments, console),
+            Command::Explain(arguments) => explain::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),
             Command::Synth(arguments) => synth::run(arguments, console),
@@ -84,6 +88,14 @@ pub fn main() -> ExitCode {
         }
     };
     let console = Console::new(&line.console);
+    // Products only appear whole under their final names, so the process may end at any moment.
+    let cancelled = ctrlc::set_handler(|| {
+        console::to_stderr("cancelled; the same command again goes on from the last finished stage");
+        std::process::exit(i32::from(Exit::Cancelled as u8));
+    });
+    if let Err(error) = cancelled {
+        console.warn(&format!("Ctrl-C cannot be handled ({error}); it will end the program without a word"));
+    }
     if let Some(threads) = line.threads {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
         if let Err(error) = pool {

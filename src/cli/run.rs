@@ -1,7 +1,7 @@
 //! `adit run`: the whole pipeline.
 
 use super::{Console, Exit, Failure, Result};
-use crate::pipeline::{self, Kind, Observer, Pipeline, STAGES, limits::Status, report};
+use crate::pipeline::{self, Kind, Observer, Pipeline, Redo, STAGES, limits::Status, report};
 use crate::warning::Warning;
 use serde_json::json;
 use std::path::PathBuf;
@@ -33,6 +33,15 @@ pub struct Arguments {
     /// Override one key of the pipeline, e.g. `map.cell_m=0.005` or `unwrap=lscm`. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Do everything again, or only the named stages, although nothing changed.
+    #[arg(long, value_name = "STAGE", num_args = 0..)]
+    force: Option<Vec<String>>,
+    /// Do this stage and all after it again.
+    #[arg(long, value_name = "STAGE")]
+    from: Option<String>,
+    /// Only tell what would be done, and why.
+    #[arg(long)]
+    explain: bool,
     /// Only check the pipeline file and print it resolved.
     #[arg(long)]
     check: bool,
@@ -58,7 +67,15 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         .out
         .or_else(|| Some(PathBuf::from("runs").join(named_after?.file_stem()?)))
         .ok_or_else(|| Failure::from(pipeline::Error::NoInput))?;
-    let outcome = pipeline::run(&pipeline, &out, &Progress { console })?;
+    if arguments.explain {
+        return super::explain::print(&pipeline::explain(&pipeline, &out)?, console);
+    }
+    let redo = Redo {
+        all: arguments.force.as_ref().is_some_and(Vec::is_empty),
+        stages: arguments.force.unwrap_or_default(),
+        from: arguments.from,
+    };
+    let outcome = pipeline::run(&pipeline, &out, &redo, &Progress { console })?;
     console.finish_bar();
     let mut lines = vec![format!("{} {}", headline(outcome.status), out.display())];
     lines.extend(report::summary_lines(&outcome.report));

@@ -36,6 +36,14 @@ pub enum Error {
         /// How many files were named.
         files: usize,
     },
+    /// A stage that does not exist.
+    #[error("there is no stage '{name}'; there are {stages}")]
+    NoStage {
+        /// What was named.
+        name: String,
+        /// All names.
+        stages: String,
+    },
     /// The run folder cannot be used.
     #[error(transparent)]
     RunFolder(#[from] run_folder::Error),
@@ -55,7 +63,7 @@ impl Error {
     /// Whose problem it is.
     pub fn kind(&self) -> Kind {
         match self {
-            Self::Settings(_) | Self::NoInput | Self::SeveralMeshes { .. } => Kind::Usage,
+            Self::Settings(_) | Self::NoInput | Self::SeveralMeshes { .. } | Self::NoStage { .. } => Kind::Usage,
             Self::RunFolder(error) => error.kind(),
             Self::Stage { kind, .. } => *kind,
         }

