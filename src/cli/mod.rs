@@ -9,6 +9,7 @@ mod exit;
 mod explain;
 mod info;
 mod measure;
+mod nights;
 mod run;
 mod unwrap;
 mod synth;
@@ -24,6 +25,12 @@ use std::process::ExitCode;
 enum Command {
     /// Turn a tunnel scan into a flat, metric map (the whole pipeline).
     Run(run::Arguments),
+    /// Map every scan that arrives in a folder.
+    Watch(nights::Watch),
+    /// Map a list of scans, one after the other.
+    Batch(nights::Batch),
+    /// Remove old runs from a folder of runs.
+    CleanRuns(nights::Clean),
     /// Tell which stages of a run are up to date, and why the others are not.
     Explain(explain::Arguments),
     /// Tell what is in a scan or mesh file, and what is suspicious about it.
@@ -42,6 +49,9 @@ impl Command {
     fn run(self, console: &Console) -> Result {
         match self {
             Command::Run(arguments) => run::run(arguments, console),
+            Command::Watch(arguments) => nights::watch(arguments, console),
+            Command::Batch(arguments) => nights::batch(arguments, console),
+            Command::CleanRuns(arguments) => nights::clean_runs(arguments, console),
             Command::Explain(arguments) => explain::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),

@@ -6,9 +6,12 @@ mod explain;
 mod known_keys;
 pub mod limits;
 mod line;
+mod page;
+mod picture;
 pub mod report;
 mod run;
 pub mod run_folder;
+pub mod series;
 pub mod settings;
 
 pub use error::{Error, Kind};

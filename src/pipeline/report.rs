@@ -3,6 +3,7 @@
 use super::error::Error;
 use super::limits::{Check, Limits, Sense, Status, number, verdict};
 use super::line::{Line, peak_memory_bytes};
+use super::page;
 use super::run::Outcome;
 use super::run_folder::{Record, RunFolder, read_record, sha256_of_bytes};
 use super::settings::Pipeline;
@@ -34,7 +35,9 @@ pub(super) fn finish(
     let report = compose(pipeline, line, input_hashes);
     let staging = folder.staging("report")?;
     let text = format!("{}\n", serde_json::to_string_pretty(&report).expect("a report is plain data"));
-    for (name, content) in [("report.json", &text), ("pipeline.toml", &toml)] {
+    let axis_csv = std::fs::read_to_string(folder.path().join("axis.csv")).unwrap_or_default();
+    let html = page::page(&report, folder.path(), &axis_csv);
+    for (name, content) in [("report.json", &text), ("report.html", &html), ("pipeline.toml", &toml)] {
         let path = staging.join(name);
         std::fs::write(&path, content).map_err(|source| super::run_folder::Error::Io {
             action: "write",

@@ -50,6 +50,10 @@ pub const MESH_STAGES: &[Stage] = &[
 /// Distance between the lines of `axis.csv`, metres.
 const AXIS_CSV_STEP_M: f64 = 0.5;
 
+/// Sections told in the report, and points of each.
+const PROFILES: usize = 6;
+const PROFILE_POINTS: usize = 120;
+
 /// How a run ended.
 #[derive(Clone, Debug)]
 pub struct Outcome {
@@ -177,7 +181,9 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
     let surface = line.product("mesh", |staging| {
         let segmentation = segmentation.get()?;
         cleaned.release();
-        let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &*axis.get()?, &pipeline.mesh))?;
+        let axis = axis.get()?;
+        let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
+        summary["profiles"] = profiles(&segmentation.section);
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
         Ok((Surface { mesh, section: segmentation.section.clone() }, summary))
     });
@@ -257,7 +263,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
             .sum();
         let summary = json!({
             "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
-            "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
+            "profiles": profiles(&section), "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
         });
         Ok((Surface { mesh, section }, summary))
     });
@@ -390,6 +396,18 @@ fn hash_inputs(files: &[PathBuf]) -> Result<Vec<String>, Error> {
 fn points_file(inputs: &[PathBuf]) -> &'static str {
     let is_ply = |p: &PathBuf| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"));
     if inputs.iter().all(is_ply) { "points.ply" } else { "points.laz" }
+}
+
+/// Mean sections at evenly spread chainages, for the report.
+fn profiles(section: &SectionField) -> serde_json::Value {
+    let millimetres = |v: f64| (v * 1000.0).round() / 1000.0;
+    let at = |i: usize| {
+        let chainage = section.start() + (i as f64 + 0.5) / PROFILES as f64 * (section.end() - section.start());
+        let angle = |k: usize| std::f64::consts::TAU * k as f64 / PROFILE_POINTS as f64 - std::f64::consts::PI;
+        let radii: Vec<f64> = (0..PROFILE_POINTS).map(|k| millimetres(section.radius(chainage, angle(k)))).collect();
+        json!({ "chainage_m": millimetres(chainage), "radii_m": radii })
+    };
+    (0..PROFILES).map(at).collect()
 }
 
 /// Distance of each vertex from the local mean section, metres, positive into the void.
