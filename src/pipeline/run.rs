@@ -9,11 +9,11 @@ use super::report;
 use super::run_folder::{RunFolder, sha256_of};
 use super::settings::Pipeline;
 use crate::axis::{self, Axis, AxisCoordinates};
-use crate::cloud::{Cloud, ScanFrame};
+use crate::cloud::ScanFrame;
 use crate::io::ply::{PlyMesh, write_mesh};
-use crate::mesh::anchor::{self, Anchors};
+use crate::mesh::anchor;
 use crate::mesh::{self, FaceId, Mesh};
-use crate::numeric::{Vec2, Vec3, statistics};
+use crate::numeric::{Vec2, Vec3};
 use crate::segment::{self, SectionField};
 use crate::unwrap::{self, Chart};
 use crate::{clean, cut, io, map};
@@ -202,9 +202,9 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
         let (cloud, chart) = (cloud.get()?, chart.get()?);
         let mesh = chart.strip().mesh();
         let (anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
-        let roundtrip = roundtrip(&anchors, mesh, &cloud);
+        let roundtrip = unwrap::round_trip(&chart, &anchors, cloud.positions());
         let mut summary = section(&summary);
-        summary["roundtrip"] = roundtrip;
+        summary["roundtrip"] = json!(roundtrip);
         Ok((PlacedPoints { uv: anchors.in_chart(mesh, chart.uv()), offsets_m: anchors.offsets().to_vec() }, summary))
     });
     let map = line.passing("map", |staging| {
@@ -417,21 +417,6 @@ fn section_offsets(mesh: &Mesh, axis: &Axis, section: &SectionField) -> Vec<f64>
         section.radius(c.chainage, c.angle()) - c.radius()
     };
     mesh.vertices().par_iter().map(offset).collect()
-}
-
-/// How far the points are from where their anchors say they are, metres. Points clamped at a border are left out:
-/// they are counted, not certified.
-fn roundtrip(anchors: &Anchors, mesh: &Mesh, cloud: &Cloud) -> serde_json::Value {
-    let normals = mesh.vertex_normals();
-    let positions = cloud.positions();
-    let mut errors: Vec<f64> = (0..anchors.len())
-        .into_par_iter()
-        .filter(|&i| anchors.is_exact(i))
-        .filter_map(|i| anchors.get(i).map(|a| (a.position(mesh, &normals) - positions[i]).norm()))
-        .collect();
-    let max = errors.iter().copied().fold(0.0, f64::max);
-    let p99 = statistics::quantile(&mut errors, 0.99);
-    json!({ "points": errors.len(), "max_m": max, "p99_m": p99 })
 }
 
 /// The axis as `axis.csv`, scan coordinates.

@@ -126,29 +126,22 @@ pub struct Distribution {
 impl Distribution {
     /// The distribution of `values` weighted by `areas`; all zero when there are none.
     pub fn of(values: &[f64], areas: &[f64]) -> Self {
-        let mut order: Vec<u32> = (0..values.len() as u32).collect();
-        order.par_sort_unstable_by(|&a, &b| values[a as usize].total_cmp(&values[b as usize]).then(a.cmp(&b)));
+        let mut order: Vec<(f64, f64)> = values.iter().copied().zip(areas.iter().copied()).collect();
+        // Equal values are ordered by area, so that the sums below are the same on any number of threads.
+        order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
         let total: f64 = areas.iter().sum();
-        let (Some(&first), Some(&last)) = (order.first(), order.last()) else { return Self::default() };
-        let mut at = [values[last as usize]; 4];
+        let (Some(&(first, _)), Some(&(last, _))) = (order.first(), order.last()) else { return Self::default() };
+        let mut at = [last; 4];
         let (mut below, mut next) = (0.0, 0);
-        for &i in &order {
-            below += areas[i as usize];
+        for &(value, area) in &order {
+            below += area;
             while next < 4 && below >= [0.05, 0.5, 0.95, 0.99][next] * total {
-                at[next] = values[i as usize];
+                at[next] = value;
                 next += 1;
             }
         }
         let mean = values.iter().zip(areas).map(|(v, w)| v * w).sum::<f64>() / total;
-        Self {
-            min: values[first as usize],
-            p05: at[0],
-            mean,
-            p50: at[1],
-            p95: at[2],
-            p99: at[3],
-            max: values[last as usize],
-        }
+        Self { min: first, p05: at[0], mean, p50: at[1], p95: at[2], p99: at[3], max: last }
     }
 }
 
