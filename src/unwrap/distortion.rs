@@ -284,7 +284,8 @@ fn segments_cross([a, b]: [Vec2; 2], [c, d]: [Vec2; 2]) -> bool {
 /// The surface with detail below about `scale` metres smoothed away: same faces, vertices moved to averages.
 ///
 /// Damped averaging over the neighbours (weights of a Gaussian of standard deviation scale / 2 reached by repeated
-/// one-ring steps); border vertices average along the border only, so the outline does not shrink inwards.
+/// one-ring steps); border vertices average along the border only. Vertices move along the normal of the smoothed surface
+/// only: sliding along the surface would count as distortion of a map that has none.
 pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
     let faces = mesh.faces();
     let count = mesh.vertices().len();
@@ -348,7 +349,17 @@ pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
             })
             .collect();
     }
-    Mesh::new(positions, faces.to_vec(), mesh.observed().to_vec()).expect("averages of finite vertices are finite")
+    let finite = "averages of finite vertices are finite";
+    let smooth = Mesh::new(positions, faces.to_vec(), mesh.observed().to_vec()).expect(finite);
+    let normals = smooth.vertex_normals();
+    let along_normals = mesh
+        .vertices()
+        .iter()
+        .zip(smooth.vertices())
+        .zip(&normals)
+        .map(|((from, to), normal)| from + normal * normal.dot(&(to - from)))
+        .collect();
+    Mesh::new(along_normals, faces.to_vec(), mesh.observed().to_vec()).expect(finite)
 }
 
 #[cfg(test)]
@@ -446,5 +457,16 @@ mod tests {
         let centre = 20 * 41 + 20;
         assert!(smooth.vertices()[centre].z.abs() < 1e-4);
         assert!(smoothed_surface(&grid(0.0), 0.25).vertices().iter().all(|p| p.z == 0.0));
+        // A flat sheet with vertices strewn unevenly stays what it is.
+        let uneven = grid(0.0);
+        let vertices: Vec<Vec3> = uneven
+            .vertices()
+            .iter()
+            .enumerate()
+            .map(|(i, p)| p + Vec3::new(0.015 * (i as f64 * 2.4).sin(), 0.015 * (i as f64 * 3.7).cos(), 0.0))
+            .collect();
+        let uneven = Mesh::all_observed(vertices, uneven.faces().to_vec()).unwrap();
+        let smooth = smoothed_surface(&uneven, 0.25);
+        assert!(smooth.vertices().iter().zip(uneven.vertices()).all(|(p, q)| (p - q).norm() < 1e-15));
     }
 }

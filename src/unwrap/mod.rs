@@ -368,7 +368,7 @@ mod tests {
         assert_eq!(parse("unwrap = \"section\"").unwrap(), Settings::of(Method::named("section").unwrap()));
         let settings = parse("[unwrap]\nsmoothing_m = 0.5\n[unwrap.section]\nwindow_m = 3").unwrap();
         assert_eq!(settings.smoothing_m, Some(0.5));
-        assert_eq!(settings.method, Method::Section(section::Settings { window_m: 3.0 }));
+        assert_eq!(settings.method, Method::Section(section::Settings { window_m: Some(3.0) }));
         assert_eq!(parse("[unwrap]").unwrap(), Settings::default());
     }
 

@@ -70,7 +70,7 @@ const CHAINAGE_TIE: f64 = 0.1;
 const BEARING_TIE: f64 = 0.25;
 /// At `straightness` 0 this tie alone says where on the page the map lies.
 const PLACE_TIE: f64 = 1e-7;
-/// Horizontal tie of `straightness` 1, where the formula has no value: that of 0.95.
+/// The horizontal tie grows no further beyond this `straightness`: rough rock has no straight axis lines.
 const STRAIGHTEST: f64 = 0.95;
 /// Steps that minimise the rigid energy first: it has no barrier, so needles in the start do not slow it down.
 const RIGID_STEPS: usize = 3;
@@ -201,7 +201,7 @@ impl<'a> Problem<'a> {
         let ruler = settings.straightness >= 1.0;
         let ratio = |straightness: f64| straightness / (1.0 - straightness);
         let half_girth = guide.summary().section.mean_girth_m / 2.0;
-        let tie = ratio(settings.straightness.min(STRAIGHTEST)) * CHAINAGE_TIE + PLACE_TIE;
+        let tie = ratio(settings.straightness.min(1.0 - 1e-6)) * CHAINAGE_TIE + PLACE_TIE;
         let areas = super::registration::vertex_areas(mesh);
         let along = (0..faces.len() as u32)
             .into_par_iter()
