@@ -2,7 +2,7 @@
 //!
 //! Use it on every tunnel mesh before flattening. Triangles that the line crosses are split, so the seam is straight on
 //! the map; vertices very near the line are taken for points of it, so no slivers arise. The seam is the cheapest edge
-//! path between the portals, where edges on the line are cheapest and the way along the edge of a hole costs nothing
+//! path between the portals, where edges on the line are cheapest and a hole costs its straight width
 //! (it is open already). Where the surface hides behind itself as seen from the axis, or has steps, the path leaves the
 //! line as shortly as it can; how far is reported.
 //!
@@ -401,10 +401,13 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
         let hole = loop_of[v as usize];
         if hole != NO_LOOP && !std::mem::replace(&mut entered[hole as usize], true) {
             for &w in &loops[hole as usize] {
-                if here < distance[w as usize] {
-                    distance[w as usize] = here;
+                // As dear as a straight seam across: a hole on the line is the shortest way, one beside it no lure.
+                let straight = (split.mesh.vertices()[w as usize] - split.mesh.vertices()[v as usize]).norm();
+                let there = here + straight;
+                if there < distance[w as usize] {
+                    distance[w as usize] = there;
                     came[w as usize] = Came::Hole(v);
-                    heap.push(Reverse((here.to_bits(), w)));
+                    heap.push(Reverse((there.to_bits(), w)));
                 }
             }
         }
