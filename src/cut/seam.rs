@@ -2,8 +2,8 @@
 //!
 //! Use it on every tunnel mesh before flattening. Triangles that the line crosses are split, so the seam is straight on
 //! the map; vertices very near the line are taken for points of it, so no slivers arise. The seam is the cheapest edge
-//! path between the portals, where edges on the line are cheapest and a hole costs its straight width
-//! (it is open already). Where the surface hides behind itself as seen from the axis, or has steps, the path leaves the
+//! path between the portals, where edges on the line are cheapest and crossing a hole costs its straight width
+//! (nothing needs cutting there). Where the surface hides behind itself as seen from the axis, or has steps, the path leaves the
 //! line as shortly as it can; how far is reported.
 //!
 //! Guarantees: the result is a [`Strip`] none of whose borders winds around the axis. Cost: linear, apart from sorting
