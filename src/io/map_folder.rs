@@ -2,8 +2,8 @@
 
 use super::geotiff::{GeoTiffWriter, RawTile, no_data_tile, sample_bytes};
 use super::png::PngWriter;
-use super::world_file::{self, Placement};
-use crate::map::{Grid, LayerDescription, Look, PaletteEntry, Picture, Piece, Samples, Sink, TILE_PX};
+use super::world_file;
+use crate::map::{Grid, LayerDescription, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX};
 use crate::numeric::Vec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};

@@ -2,21 +2,10 @@
 //!
 //! The last two lines are the *centre* of the upper left pixel, unlike the tie point of a GeoTIFF, which is its corner.
 
-use crate::map::Grid;
+use crate::map::Placement;
 use crate::numeric::Vec2;
 use std::io;
 use std::path::{Path, PathBuf};
-
-/// Where the pixels of a picture lie in chart metres.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Placement {
-    /// Chart position of the centre of the upper left pixel.
-    pub first_centre: Vec2,
-    /// Metres to the right from one column to the next.
-    pub step_u: f64,
-    /// Metres up from one row to the next (negative: rows run down).
-    pub step_v: f64,
-}
 
 /// Why a world file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -46,18 +35,10 @@ pub enum Error {
     },
 }
 
-impl Placement {
-    /// The placement of a map's own grid.
-    pub fn of_grid(grid: &Grid) -> Self {
-        let first_centre = grid.chart_from_pixel(Vec2::new(0.5, 0.5));
-        Self { first_centre, step_u: grid.cell_m(), step_v: -grid.cell_m() }
-    }
-
-    /// The six lines.
-    pub fn to_text(&self) -> String {
-        let (c, u, v) = (self.first_centre, self.step_u, self.step_v);
-        format!("{u:.12}\n0.0\n0.0\n{v:.12}\n{:.9}\n{:.9}\n", c.x, c.y)
-    }
+/// The six lines of a world file.
+fn to_text(placement: &Placement) -> String {
+    let (c, u, v) = (placement.first_centre, placement.step_u, placement.step_v);
+    format!("{u:.12}\n0.0\n0.0\n{v:.12}\n{:.9}\n{:.9}\n", c.x, c.y)
 }
 
 /// The name of the world file of a picture: `.png` -> `.pgw`, `.tif` -> `.tfw`, `.jpg` -> `.jgw`.
@@ -77,7 +58,7 @@ pub fn path_of(picture: &Path) -> PathBuf {
 /// [`Error::Io`].
 pub fn write(picture: &Path, placement: &Placement) -> Result<(), Error> {
     let path = path_of(picture);
-    std::fs::write(&path, placement.to_text()).map_err(|source| Error::Io { path, source })
+    std::fs::write(&path, to_text(placement)).map_err(|source| Error::Io { path, source })
 }
 
 /// Reads the world file of a picture; `None` when there is none.
@@ -104,6 +85,7 @@ pub fn read(picture: &Path) -> Result<Option<Placement>, Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::map::Grid;
 
     #[test]
     fn centre_of_the_first_pixel() {

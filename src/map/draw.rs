@@ -18,7 +18,7 @@ use rayon::prelude::*;
 const PIECES_AT_ONCE: usize = 4;
 /// Automatic limit of the distance from the surface: this many times the 90 % quantile, within bounds in metres.
 const OFFSET_LIMIT: f64 = 5.0;
-const OFFSET_LIMIT_BOUNDS_M: (f64, f64) = (0.05, 0.3);
+const OFFSET_LIMIT_BOUNDS_M: (f64, f64) = (0.1, 0.3);
 /// Steps of the offset layer, metres: far below any scanner's noise, and it lets the file be compressed.
 const OFFSET_STEP_M: f64 = 1.0 / 8192.0;
 /// Pixel size of charts without scan points, as a share of the mean edge length.
@@ -149,7 +149,9 @@ impl<'a> Plan<'a> {
         let mut warnings = Vec::new();
         let (low, high) = extent(input.chart);
 
-        let max_offset_m = settings.max_offset_m.unwrap_or_else(|| automatic_max_offset(input));
+        let max_offset_m = settings.max_offset_m.unwrap_or_else(|| {
+            input.points.map_or(OFFSET_LIMIT_BOUNDS_M.1, |(_, p)| automatic_max_offset_m(p.offsets_m))
+        });
         let (mut points_off_surface, mut points_unanchored) = (0, 0);
         let mut sampled = None;
         if let Some((cloud, points)) = input.points {
@@ -409,9 +411,10 @@ fn is_on_surface(offset_m: f64, max_offset_m: f64) -> bool {
     offset_m.abs() <= max_offset_m
 }
 
-fn automatic_max_offset(input: &DrawInput) -> f64 {
-    let Some((_, points)) = input.points else { return OFFSET_LIMIT_BOUNDS_M.1 };
-    let mut sizes: Vec<f64> = points.offsets_m.iter().map(|o| o.abs()).filter(|o| o.is_finite()).collect();
+/// The distance from the surface (metres) up to which points belong to it: five times the 90 % quantile of all
+/// distances (NaN: no distance), 0.1 to 0.3 m. The same for drawing the map and for the way back.
+pub fn automatic_max_offset_m(offsets_m: &[f64]) -> f64 {
+    let mut sizes: Vec<f64> = offsets_m.iter().map(|o| o.abs()).filter(|o| o.is_finite()).collect();
     let typical = statistics::quantile(&mut sizes, 0.9).unwrap_or(0.0);
     (OFFSET_LIMIT * typical).clamp(OFFSET_LIMIT_BOUNDS_M.0, OFFSET_LIMIT_BOUNDS_M.1)
 }

@@ -160,6 +160,36 @@ impl Grid {
     }
 }
 
+/// Where the pixels of a picture lie in chart metres: a grid that need not be square or aligned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// Chart position of the centre of the upper left pixel.
+    pub first_centre: Vec2,
+    /// Metres to the right from one column to the next.
+    pub step_u: f64,
+    /// Metres up from one row to the next (negative: rows run down).
+    pub step_v: f64,
+}
+
+impl Placement {
+    /// The placement of a map's own grid.
+    pub fn of_grid(grid: &Grid) -> Self {
+        let first_centre = grid.chart_from_pixel(Vec2::new(0.5, 0.5));
+        Self { first_centre, step_u: grid.cell_m(), step_v: -grid.cell_m() }
+    }
+
+    /// Chart position of continuous pixel coordinates; (0, 0) is the upper left corner of the picture.
+    pub fn chart_from_pixel(&self, pixel: Vec2) -> Vec2 {
+        self.first_centre + Vec2::new((pixel.x - 0.5) * self.step_u, (pixel.y - 0.5) * self.step_v)
+    }
+
+    /// Continuous pixel coordinates of a chart position.
+    pub fn pixel_from_chart(&self, uv: Vec2) -> Vec2 {
+        let d = uv - self.first_centre;
+        Vec2::new(d.x / self.step_u + 0.5, d.y / self.step_v + 0.5)
+    }
+}
+
 /// The pixel size that suits points `spacing_u_m` x `spacing_v_m` apart on a chart of the given extent: on the series
 /// 1, 2, 5, 10, ... millimetres, below the finer of the two spacings but not so fine that most pixels are interpolated.
 pub fn automatic_cell_m(spacing_u_m: f64, spacing_v_m: f64, extent: Vec2) -> f64 {

@@ -21,8 +21,8 @@ pub(crate) mod example;
 
 pub use blend::Support;
 pub use color_ramp::{Ramp, label_color};
-pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, draw};
-pub use grid::{Grid, PixelRect, TILE_PX, automatic_cell_m};
+pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, automatic_max_offset_m, draw};
+pub use grid::{Grid, PixelRect, Placement, TILE_PX, automatic_cell_m};
 pub use layer::{
     COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, FILLED_COLOR, Layer, LayerDescription, Look, NoData,
     OBSERVED_COLOR, PaletteEntry, Resampling, SampleType, Samples, UNLABELLED_COLOR, color_distance, palette,
@@ -45,7 +45,7 @@ pub struct Settings {
     /// pixels farther away stay empty. Automatic: four point spacings in each direction, 0.05 to 1 m.
     pub fill_m: Option<f64>,
     /// Scan points farther from the surface than this (metres: pipes, cables, people) do not colour the wall.
-    /// Automatic: five times the typical distance, 0.05 to 0.3 m.
+    /// Automatic: five times the 90 % quantile of all distances, 0.1 to 0.3 m.
     pub max_offset_m: Option<f64>,
     /// The layers to draw. `relief` is added when the scan has no colour.
     pub layers: Vec<Layer>,
