@@ -8,6 +8,7 @@ mod console;
 mod exit;
 mod explain;
 mod info;
+mod lift;
 mod measure;
 mod nights;
 mod run;
@@ -35,6 +36,8 @@ enum Command {
     Explain(explain::Arguments),
     /// Tell what is in a scan or mesh file, and what is suspicious about it.
     Info(info::Arguments),
+    /// Bring what was painted on the map back to the points of the scan.
+    Lift(lift::Arguments),
     /// Flatten one mesh.
     Unwrap(unwrap::Arguments),
     /// Make a synthetic scan of a tunnel that is known in closed form.
@@ -54,6 +57,7 @@ impl Command {
             Command::CleanRuns(arguments) => nights::clean_runs(arguments, console),
             Command::Explain(arguments) => explain::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
+            Command::Lift(arguments) => lift::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),
             Command::Synth(arguments) => synth::run(arguments, console),
             Command::CompareMethods(arguments) => compare_methods::run(arguments, console),

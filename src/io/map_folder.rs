@@ -80,6 +80,15 @@ pub struct LabelsFile {
     pub classes: Vec<PaletteEntry>,
 }
 
+impl LabelsFile {
+    /// Where the pixels of the pictures lie.
+    pub fn picture_placement(&self) -> Placement {
+        let step = self.picture_cell_m;
+        let first_centre = Vec2::new(self.u_min_m + step / 2.0, self.v_max_m - step / 2.0);
+        Placement { first_centre, step_u: step, step_v: -step }
+    }
+}
+
 impl MapFolder {
     /// A sink that writes into `folder`, which must exist.
     pub fn new(folder: &Path) -> Self {

@@ -18,6 +18,7 @@ mod map_folder;
 pub mod ply;
 mod mesh_formats;
 mod mesh_scan;
+pub mod picture;
 pub mod png;
 mod pcd;
 mod point_table;

@@ -208,7 +208,10 @@ impl RowPlan {
         };
         let fits_width = row_m / ROW_PX;
         let fits_height = rows as f64 * extent.y * 1.3 / MAX_HEIGHT_PX;
-        let cell_m = map_cell_m.max(next_in_series(fits_width.max(fits_height).max(1e-4)));
+        // Whole millimetres; finer for models of a metre or so.
+        let wanted = fits_width.max(fits_height).max(1e-5);
+        let unit = if wanted > 1e-3 { 1000.0 } else { 1e5 };
+        let cell_m = map_cell_m.max((wanted * unit).ceil() / unit);
         let row_px = row_m / cell_m;
         let cap = (row_px / 110.0).clamp(9.0, 42.0);
         Self {
@@ -416,7 +419,7 @@ const VIEW: &str =
 
 /// Steps of the ticks and of the labels along the tunnel, metres: labels must not touch each other.
 fn tick_steps(row_m: f64, cap_m: f64) -> (f64, f64) {
-    let label_width_m = 9.0 * cap_m;
+    let label_width_m = 6.5 * cap_m;
     let label_m =
         [1.0, 5.0, 10.0, 50.0, 100.0].into_iter().find(|&l| l > label_width_m && row_m / l <= 16.0).unwrap_or(500.0);
     let label_m = if row_m < 4.0 { 0.5 } else { label_m };
