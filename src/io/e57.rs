@@ -55,7 +55,7 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     {
         /// One slot: rows are filled in order.
         const ALL: usize = usize::MAX;
-        let mut slots = table.slots(ALL.min((total as usize).max(1)));
+        let mut slots = table.slots((total as usize).max(1));
         for (index, cloud) in clouds.iter().enumerate() {
             let station = cloud.transform.as_ref().map_or(u16::MAX, |pose| {
                 let t = &pose.translation;

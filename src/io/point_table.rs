@@ -111,7 +111,7 @@ impl PointTable {
 
     /// The rows in runs of `run` (the last may be shorter).
     pub(super) fn slots(&mut self, run: usize) -> Vec<TableSlots<'_>> {
-        fn runs<'a, T>(column: Option<&'a mut [T]>, run: usize) -> impl Iterator<Item = Option<&'a mut [T]>> {
+        fn runs<T>(column: Option<&mut [T]>, run: usize) -> impl Iterator<Item = Option<&mut [T]>> {
             let mut chunks = column.map(|c| c.chunks_mut(run));
             std::iter::from_fn(move || Some(chunks.as_mut().and_then(Iterator::next)))
         }

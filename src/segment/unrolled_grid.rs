@@ -244,6 +244,6 @@ mod tests {
                 .fold(f64::INFINITY, f64::min);
             assert!((found[k] - best).abs() < 1e-12, "{k}: {} {best}", found[k]);
         }
-        assert!(squared_distance(&vec![false; 12], 3, 4, scale).iter().all(|d| d.is_infinite()));
+        assert!(squared_distance(&[false; 12], 3, 4, scale).iter().all(|d| d.is_infinite()));
     }
 }

@@ -68,7 +68,7 @@ impl Default for Settings {
 pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Result<(Vec<Vec2>, SolveSummary), Error> {
     let guide = guide.ok_or(Error::NeedsAxis { method: "deform-skin" })?;
     let turn = settings.bone_turn_deg;
-    if !(turn >= 1.0 && turn <= 90.0) {
+    if !(1.0..=90.0).contains(&turn) {
         return Err(Error::Setting { key: "deform-skin.bone_turn_deg", value: turn, must: "1 to 90 degrees" });
     }
     let solve_error = |e: sparse::Error| Error::Solve { method: "deform-skin", what: e.to_string() };
