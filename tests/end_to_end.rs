@@ -322,7 +322,7 @@ fn bad_input_is_told_in_one_line() {
         ("nothing finite", input("nan.ply"), 3, "nan.ply"),
         ("not a tunnel", input("plane.ply"), 3, ""),
         ("misspelt key", with(input("scan.laz"), &["--set", "map.cel_m=1"]), 2, "map.cell_m"),
-        ("bad value", with(input("scan.laz"), &["--set", "map.cell_m=wide"]), 2, "map.cell_m"),
+        ("bad value", with(input("scan.laz"), &["--set", "map.cell_m=wide"]), 2, "map.cell_m=wide"),
         (
             "unwritable",
             ["run", "--input", &file("scan.laz"), "--out", &file("file/run")].map(str::to_owned).to_vec(),
@@ -331,7 +331,7 @@ fn bad_input_is_told_in_one_line() {
         ),
         ("no such pipeline", vec!["run".into(), file("no.toml")], 2, "no.toml"),
         ("no input", vec!["run".into()], 2, "input"),
-        ("unknown format", vec!["synth".into(), "--out".into(), file("x.xyz")], 6, "xyz"),
+        ("unknown format", vec!["synth".into(), "--out".into(), file("x.xyz")], 2, "xyz"),
         ("impossible tunnel", vec!["synth".into(), "--out".into(), file("x.laz"), "--radius=1".into()], 2, "radius"),
     ];
     for (name, arguments, code, names) in table {

@@ -167,6 +167,11 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     if !(0.01..=1000.0).contains(&arguments.step_mm) {
         return Err(Failure::message(Exit::Usage, format!("--step-mm {} is not from 0.01 to 1000", arguments.step_mm)));
     }
+    let extension = arguments.out.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    if !matches!(extension.as_str(), "las" | "laz" | "ply") {
+        let out = arguments.out.display();
+        return Err(Failure::message(Exit::Usage, format!("cannot write '{out}': name it .laz, .las or .ply")));
+    }
     let recipe = arguments.recipe();
     let tunnel = recipe.tunnel().map_err(usage)?;
     let scan = synthetic::scan(&tunnel, &recipe.plan().map_err(usage)?).map_err(usage)?;
