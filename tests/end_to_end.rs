@@ -48,9 +48,9 @@ fn report(folder: &Path) -> serde_json::Value {
 
 /// The columns label, chainage, girth (metres; NaN for none) of a LAS file that has them as its last extra bytes.
 fn map_columns(file: &Path) -> Vec<(u32, f64, f64)> {
-    let mut reader = las::Reader::from_path(file).unwrap();
+    let records = las::Reader::from_path(file).unwrap().read_all().unwrap();
     let metres = |raw: i64, none: i64| if raw == none { f64::NAN } else { raw as f64 * 1e-6 };
-    reader
+    records
         .points()
         .map(|p| {
             let bytes = p.unwrap().extra_bytes;
@@ -221,6 +221,8 @@ fn labels_survive_the_way_to_the_map_and_back() {
         adit(&["lift", path(&folder), "--labels", path(&folder.join("map/labels.png")), "--out", path(&lifted)]);
     assert!(output.status.success(), "{}", text(&output));
     let before: Vec<u32> = las::Reader::from_path(&scan)
+        .unwrap()
+        .read_all()
         .unwrap()
         .points()
         .map(|p| u32::from_le_bytes(p.unwrap().extra_bytes[0..4].try_into().unwrap()))

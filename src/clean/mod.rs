@@ -249,7 +249,8 @@ mod tests {
         }
         let wall = points.len();
         for _ in 0..60 {
-            let (angle, radius): (f64, f64) = (random.random_range(0.0..6.28), random.random_range(5.5..15.0));
+            let (angle, radius): (f64, f64) =
+                (random.random_range(0.0..std::f64::consts::TAU), random.random_range(5.5..15.0));
             points.push(Vec3::new(random.random_range(15.0..19.5), radius * angle.cos(), radius * angle.sin()));
         }
         (points, wall)

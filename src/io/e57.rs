@@ -53,8 +53,7 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     let mut station_of_record = Vec::with_capacity(total as usize);
     let mut row = 0;
     {
-        /// One slot: rows are filled in order.
-        const ALL: usize = usize::MAX;
+        // One slot: rows are filled in order.
         let mut slots = table.slots((total as usize).max(1));
         for (index, cloud) in clouds.iter().enumerate() {
             let station = cloud.transform.as_ref().map_or(u16::MAX, |pose| {

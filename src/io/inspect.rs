@@ -114,9 +114,10 @@ fn scan_info(path: &Path, bytes: u64, mut scan: FileScan, settings: &Settings) -
         warnings.push(Warning::new("no-points", "there are no points to map"));
     }
     if let (Some([low, high]), None, None) = (scan.info.bounds, settings.unit, stated)
-        && !degrees {
-            super::assemble::guess_unit(&(Vec3::from(high) - Vec3::from(low)), &mut warnings);
-        }
+        && !degrees
+    {
+        super::assemble::guess_unit(&(Vec3::from(high) - Vec3::from(low)), &mut warnings);
+    }
     let (spacing, density) = spacing_and_density(&scan.positions);
     let truncated = !settings.allow_truncated && warnings.iter().any(|w| w.code == "truncated");
     let usable = !scan.positions.is_empty() && !degrees && !truncated;

@@ -32,7 +32,8 @@ impl Ramp {
             Ramp::Diverging => &DIVERGING,
             Ramp::Heat => &HEAT,
         };
-        let position = t.max(0.0).min(1.0) * (stops.len() - 1) as f64;
+        let t = if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) };
+        let position = t * (stops.len() - 1) as f64;
         let i = (position as usize).min(stops.len() - 2);
         let f = position - i as f64;
         let mix = |k: usize| f64::from(stops[i][k]) * (1.0 - f) + f64::from(stops[i + 1][k]) * f;

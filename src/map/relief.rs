@@ -4,7 +4,7 @@ use crate::numeric::{Vec2, Vec3};
 use crate::unwrap::Chart;
 
 /// Direction towards the light in (u, v, into the void): from the upper left, half way up.
-const LIGHT: [f64; 3] = [-0.5, 0.5, 0.707_106_781_186_547_6];
+const LIGHT: [f64; 3] = [-0.5, 0.5, std::f64::consts::FRAC_1_SQRT_2];
 /// Slopes are drawn this much steeper, so that rock a few centimetres rough can be seen.
 const EXAGGERATION: f64 = 1.5;
 

@@ -218,11 +218,15 @@ impl Spacing {
                     let (mut sum, mut count) = (0.0, 0);
                     for (dr, dc) in (-1..=1).flat_map(|dr| (-1..=1).map(move |dc| (dr, dc))) {
                         let (r, c) = (r + dr, c + dc);
-                        if r >= 0 && c >= 0 && r < down as i64 && c < across as i64
-                            && let Some(x) = measured[r as usize * across + c as usize][d] {
-                                sum += x.ln();
-                                count += 1;
-                            }
+                        if r >= 0
+                            && c >= 0
+                            && r < down as i64
+                            && c < across as i64
+                            && let Some(x) = measured[r as usize * across + c as usize][d]
+                        {
+                            sum += x.ln();
+                            count += 1;
+                        }
                     }
                     if count == 0 { typical[d] as f32 } else { (sum / f64::from(count)).exp() as f32 }
                 })

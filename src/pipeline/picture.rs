@@ -38,7 +38,7 @@ pub(super) fn thumbnail(path: &Path, widest: usize) -> Option<Vec<u8>> {
         }
         if y % step == step - 1 || y == height - 1 {
             for (sum, count) in sums.iter_mut().zip(&mut counts) {
-                thin.extend(sum[..channels].iter().map(|s| if *count > 0 { (s / *count) as u8 } else { 0 }));
+                thin.extend(sum[..channels].iter().map(|s| s.checked_div(*count).unwrap_or(0) as u8));
                 (*sum, *count) = ([0; 4], 0);
             }
         }

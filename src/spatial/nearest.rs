@@ -322,7 +322,7 @@ mod tests {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(8);
         let cylinder: Vec<Vec3> = (0..3000)
             .map(|_| {
-                let a: f64 = random.random_range(0.0..6.28);
+                let a: f64 = random.random_range(0.0..std::f64::consts::TAU);
                 Vec3::new(random.random_range(0.0..20.0), 3.0 * a.cos(), 3.0 * a.sin())
             })
             .collect();

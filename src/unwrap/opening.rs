@@ -74,8 +74,7 @@ pub(super) fn open_section(section: &[Vec2], girth: &[f64], t: f64) -> Vec<Vec2>
     // Outwards from the crown to either side, where the direction is near zero and its branch is known.
     for side in [1isize, -1] {
         let (mut here, mut angle) = (crown, 0.0);
-        loop {
-            let Some(next) = here.checked_add_signed(side).filter(|&n| n < section.len()) else { break };
+        while let Some(next) = here.checked_add_signed(side).filter(|&n| n < section.len()) {
             let chord = (section[next] - section[here]) * side as f64;
             angle += wrap_angle(chord.y.atan2(chord.x) - angle);
             let length = (1.0 - t) * chord.norm() + t * (girth[next] - girth[here]).abs();

@@ -255,7 +255,7 @@ fn poses_from_a_file() {
     let pose = "[[scan]]\nfile = \"s1.xyz\"\npose = [[0.0, -1.0, 0.0, 500000.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]]\n";
     std::fs::write(&poses, pose).unwrap();
     let settings = Settings { poses: Some(poses.clone()), ..Default::default() };
-    let (cloud, _) = read_cloud(&[scan.clone()], &settings).unwrap();
+    let (cloud, _) = read_cloud(std::slice::from_ref(&scan), &settings).unwrap();
     assert_eq!(in_scan(&cloud), [Vec3::new(500_000.0, 1.0, 2.0), Vec3::new(500_000.0, 2.0, 2.0)]);
     let station = cloud.frame().scan_from_local(&cloud.stations()[0].position_in_local);
     assert_eq!(station, Vec3::new(500_000.0, 0.0, 2.0));

@@ -127,7 +127,7 @@ fn a_truncated_file_is_refused_or_used_as_set() {
     write_cloud(&cloud(1000), None, &path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    let error = read_cloud(&[path.clone()], &Settings::default()).unwrap_err();
+    let error = read_cloud(std::slice::from_ref(&path), &Settings::default()).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::BadInput);
     assert!(error.to_string().contains("promises 1000 records"), "{error}");
     let settings = Settings { allow_truncated: true, ..Default::default() };

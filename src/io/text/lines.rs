@@ -128,8 +128,7 @@ fn parse_block(text: &[u8], line: &Line, roles: &Roles) -> Block {
     {
         let mut slots = table.slots(rows.max(1));
         let mut row = Vec::with_capacity(line.columns);
-        let mut next = 0;
-        for (offset, text) in lines.iter().enumerate().filter(|(_, l)| !is_void(l)) {
+        for (next, (offset, text)) in lines.iter().enumerate().filter(|(_, l)| !is_void(l)).enumerate() {
             let parsed = if text.len() > LONGEST_LINE {
                 Err("it is too long".into())
             } else {
@@ -142,7 +141,6 @@ fn parse_block(text: &[u8], line: &Line, roles: &Roles) -> Block {
                     break;
                 }
             }
-            next += 1;
         }
     }
     table.add_bad_labels(bad_labels);
