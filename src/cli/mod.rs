@@ -1,7 +1,7 @@
 //! The command line: one file per subcommand, one line per subcommand in the table below.
 //!
 //! A subcommand is a module with `Arguments` (clap) and `fn run(arguments, &Console) -> Result`. To add one: a `mod` line,
-//! a variant of [`Command`] whose doc comment is its one-line help, and an arm in [`Command::run`].
+//! a variant of `Command` whose doc comment is its one-line help, and an arm in `Command::run`.
 
 mod compare_methods;
 mod console;

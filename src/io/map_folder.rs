@@ -189,7 +189,7 @@ impl MapFolder {
 /// Writes a picture such as the overview.
 ///
 /// # Errors
-/// [`Error::Io`].
+/// `Error::Io`.
 pub fn write_picture(path: &Path, picture: &Picture) -> Result<(), Error> {
     let failed = |source| Error::Io { path: path.to_owned(), source };
     let mut writer = PngWriter::create(path, picture.width, picture.height, None).map_err(failed)?;

@@ -140,7 +140,7 @@ impl Grid {
         inside.then(|| (p.x as usize, p.y as usize))
     }
 
-    /// The pieces in which the map is computed, row by row from the top, [`WORK_WIDTH_PX`] x [`TILE_PX`] or less.
+    /// The pieces in which the map is computed, row by row from the top, `WORK_WIDTH_PX` x `TILE_PX` or less.
     pub fn work_rows(&self) -> impl Iterator<Item = Vec<PixelRect>> + use<> {
         let (width, height) = (self.width, self.height);
         (0..height.div_ceil(TILE_PX)).map(move |r| {
