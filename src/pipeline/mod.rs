@@ -8,6 +8,7 @@ pub mod limits;
 mod line;
 mod page;
 mod picture;
+pub mod reference;
 pub mod report;
 mod run;
 pub mod run_folder;

@@ -58,8 +58,10 @@ pub(super) fn page(report: &Value, folder: &Path, axis_csv: &str) -> String {
     html
 }
 
+/// The limits, without the one that differs from run to run.
 fn checks(report: &Value) -> impl Iterator<Item = &Value> {
-    report.get("limits").and_then(Value::as_array).into_iter().flatten()
+    let all = report.get("limits").and_then(Value::as_array).into_iter().flatten();
+    all.filter(|c| c.get("name").and_then(Value::as_str) != Some("duration_s"))
 }
 
 fn figure(html: &mut String, folder: &Path, name: &str, caption: &str) {
@@ -239,14 +241,8 @@ fn provenance(html: &mut String, report: &Value) {
     }
     let version = escape(report.get("adit_version").and_then(Value::as_str).unwrap_or(""));
     let _ = writeln!(html, "<tr><td>Adit</td><td>{version}</td></tr>");
-    if let Some(peak) = report.get("peak_memory_bytes").and_then(Value::as_f64) {
-        let _ = writeln!(html, "<tr><td>Peak memory</td><td>{} MiB</td></tr>", number((peak / 1_048_576.0).round()));
-    }
-    for (name, section) in report.as_object().into_iter().flatten() {
-        if let Some(seconds) = section.get("seconds").and_then(Value::as_f64) {
-            let _ = writeln!(html, "<tr><td>{}</td><td>{} s</td></tr>", escape(name), number(seconds));
-        }
-    }
+    // Timings are left to report.json: this page is a product, and products have the same bytes on every run.
+    html.push_str("<tr><td>Timings, peak memory</td><td>in <code>report.json</code></td></tr>\n");
     let settings = report.get("pipeline").map(|p| serde_json::to_string_pretty(p).unwrap_or_default());
     let _ = writeln!(
         html,

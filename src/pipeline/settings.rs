@@ -280,3 +280,76 @@ fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf
     }
     deserializer.deserialize_any(Paths)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refused(text: &str, overrides: &[&str]) -> String {
+        let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
+        Pipeline::parse(text, "night.toml", &overrides).unwrap_err().to_string()
+    }
+
+    fn with(text: &str, overrides: &[&str]) -> Pipeline {
+        let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
+        Pipeline::parse(text, "night.toml", &overrides).unwrap()
+    }
+
+    #[test]
+    fn an_unknown_key_is_told_with_its_place_and_the_nearest_one() {
+        assert_eq!(
+            refused("[map]\ncell_m = 0.01\n  cel_m = 1\n", &[]),
+            "night.toml:3:3: there is no key 'map.cel_m'; did you mean 'map.cell_m'?"
+        );
+        assert_eq!(refused("[maps]\n", &[]), "night.toml:1:2: there is no key 'maps'; did you mean 'map'?");
+        assert!(refused("", &["seam_angle_deg=90"]).ends_with("did you mean 'cut.seam_angle_deg'?"));
+    }
+
+    #[test]
+    fn a_wrong_value_is_told_with_its_place() {
+        assert!(refused("\n[map]\ncell_m = 'small'\n", &[]).starts_with("night.toml:3:10: "));
+        assert!(refused("[map]\n", &["map.cell_m=small"]).starts_with("--set map.cell_m=small: "));
+        assert!(refused("[map\n", &[]).starts_with("night.toml:1:"));
+        assert!(refused("", &["map.cell_m"]).contains("key=value"));
+    }
+
+    #[test]
+    fn overrides_win_in_order() {
+        let pipeline = with("[map]\ncell_m = 0.5\n", &["map.cell_m=0.1", "map.cell_m=0.2"]);
+        assert_eq!(pipeline.map.cell_m, Some(0.2));
+    }
+
+    #[test]
+    fn naming_a_method_replaces_the_one_in_the_file() {
+        for text in ["unwrap = 'section'\n", "[unwrap.section]\n", "[unwrap]\nsmoothing_m = 0.5\n", ""] {
+            assert_eq!(with(text, &["unwrap=lscm"]).unwrap.method.name(), "lscm", "{text}");
+            let iterated = with(text, &["unwrap.arap.max_iterations=7"]);
+            assert_eq!(iterated.unwrap.method.name(), "arap", "{text}");
+        }
+        assert_eq!(with("[unwrap]\nsmoothing_m = 0.5\n", &["unwrap=lscm"]).settings_of("unwrap")["smoothing_m"], 0.5);
+    }
+
+    #[test]
+    fn the_resolved_file_gives_the_same_pipeline() {
+        let pipeline = with("input = 'a.laz'\n[limits]\nflipped_faces = 3\n", &["unwrap=slim", "map.cell_m=0.004"]);
+        assert_eq!(Pipeline::parse(&pipeline.to_toml(), "resolved", &[]).unwrap(), pipeline);
+    }
+
+    #[test]
+    fn paths_are_relative_to_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("p.toml");
+        std::fs::write(&file, "input = ['scan.laz']\n[axis]\nalignment = 'axis.csv'\n").unwrap();
+        let pipeline = Pipeline::load(&file, &[]).unwrap();
+        assert_eq!(pipeline.input, [folder.path().join("scan.laz")]);
+        assert_eq!(pipeline.axis.alignment, Some(folder.path().join("axis.csv")));
+    }
+
+    #[test]
+    fn the_pipelines_that_come_with_adit_are_valid() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("pipelines");
+        for file in std::fs::read_dir(folder).unwrap() {
+            Pipeline::load(&file.unwrap().path(), &[]).unwrap();
+        }
+    }
+}
