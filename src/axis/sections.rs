@@ -23,6 +23,8 @@ const BLOCK_RADII: f64 = 2.5;
 const TOLERANCE_RADII: f64 = 0.015;
 /// Slices supported by less than this share of the usual support are not tunnel when they lie beyond the ends.
 const END_SUPPORT: f64 = 0.5;
+/// Surface within this share of the mean section's radius belongs to the section.
+pub(super) const NEAR: f64 = 0.2;
 /// Rounds of slicing and smoothing.
 const ROUNDS: usize = 6;
 /// A round that moves the axis less than this share of the radius ends the refinement.
@@ -62,7 +64,7 @@ impl Slices {
 
     /// Share of the directions in which slice `i` has surface near the mean section.
     pub fn coverage(&self, i: usize) -> f64 {
-        let near = |a: usize| (self.radii[i][a] - self.mean[i][a]).abs() < 0.35 * self.mean[i][a];
+        let near = |a: usize| (self.radii[i][a] - self.mean[i][a]).abs() < NEAR * self.mean[i][a];
         (0..DIRECTIONS).filter(|&a| near(a)).count() as f64 / DIRECTIONS as f64
     }
 }

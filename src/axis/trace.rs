@@ -7,7 +7,7 @@
 //! refused with numbers. Guarantees: the same axis for any number of threads.
 
 use super::enclosed_void::{EnclosedVoid, State, edge_for, enclosed_void};
-use super::sections::{DIRECTIONS, Refined, direction_of, refine, slice};
+use super::sections::{DIRECTIONS, NEAR, Refined, direction_of, refine, slice};
 use super::skeleton::{self, Skeleton};
 use super::{Axis, AxisCoordinates, Error};
 use crate::clean::Spacing;
@@ -38,7 +38,9 @@ const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
 /// How far beyond the ends of the void more tunnel is looked for, in radii of the section.
 const REACH_RADII: f64 = 8.0;
 /// The tunnel ends where less than this share of the usual directions is covered.
-const PORTAL_COVERAGE: f64 = 0.6;
+const PORTAL_COVERAGE: f64 = 0.72;
+/// In the outermost slice the tunnel begins where this share of the directions has begun.
+const BEGUN: f64 = 0.15;
 /// Steeper than this from end to end, chainage runs downwards.
 const DOWNWARDS_DEG: f64 = 60.0;
 /// More points outside the axis' range than this is worth a warning, percent.
@@ -163,7 +165,7 @@ pub struct Summary {
     pub enclosed_share: Option<f64>,
     /// Cell of the coarse grid, metres.
     pub coarse_cell_m: Option<f64>,
-    /// Median share of directions around the axis in which there is surface, 0 to 1.
+    /// Median share of directions around the axis with surface near the mean section, 0 to 1.
     pub coverage: Option<f64>,
     /// Movements of the section's centre along less than this are relief, not axis; metres.
     pub smoothing_wavelength_m: Option<f64>,
@@ -417,7 +419,7 @@ fn covered_range(surface: &[Vec3], refined: &Refined, least_step_m: f64) -> Opti
     let first = coverage.iter().position(|c| *c >= limit)?;
     let last = coverage.iter().rposition(|c| *c >= limit)?;
     // Within the outermost slices: where the wall begins in each direction.
-    let needed = ((limit * DIRECTIONS as f64).ceil() as usize).max(1);
+    let needed = ((BEGUN * DIRECTIONS as f64).ceil() as usize).max(1);
     let slice_start = |i: usize| slices.start + i as f64 * slices.step_m;
     let extreme = |from: f64, to: f64, sign: f64| -> f64 {
         let mut nearest = [f64::INFINITY; DIRECTIONS];
@@ -425,7 +427,7 @@ fn covered_range(surface: &[Vec3], refined: &Refined, least_step_m: f64) -> Opti
             let c: AxisCoordinates = axis.project(p);
             if c.chainage >= from && c.chainage <= to {
                 let mean = slices.mean_radius(&c);
-                if (c.radius() - mean).abs() < 0.35 * mean {
+                if (c.radius() - mean).abs() < NEAR * mean {
                     let a = direction_of(&c);
                     nearest[a] = nearest[a].min(sign * c.chainage);
                 }
@@ -433,7 +435,10 @@ fn covered_range(surface: &[Vec3], refined: &Refined, least_step_m: f64) -> Opti
         }
         let mut begun: Vec<f64> = nearest.iter().copied().filter(|n| n.is_finite()).collect();
         begun.sort_unstable_by(f64::total_cmp);
-        sign * begun[(needed - 1).min(begun.len() - 1)]
+        // Nothing near the mean section itself although the medians are: the slice's own border.
+        begun
+            .get((needed - 1).min(begun.len().saturating_sub(1)))
+            .map_or(if sign > 0.0 { from } else { to }, |s| sign * s)
     };
     let start = extreme(slice_start(first), slice_start(first + 1), 1.0);
     let end = extreme(slice_start(last), slice_start(last + 1), -1.0);

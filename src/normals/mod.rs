@@ -30,8 +30,13 @@ use serde::{Deserialize, Serialize};
 
 /// Neighbourhoods tried in turn, the point included.
 const NEIGHBOURHOODS: [usize; 3] = [10, 18, 32];
-/// A larger neighbourhood may scatter this much more about its plane than the one before.
-const MORE_SCATTER: f64 = 1.15;
+/// The same for a scan whose noise is not small against its spacing.
+const NOISY_NEIGHBOURHOODS: [usize; 3] = [18, 32, 64];
+/// Noise over spacing from which a scan is noisy in that sense.
+const NOISY: f64 = 0.25;
+/// A larger neighbourhood may scatter more about its plane than the one before by this many standard errors of the
+/// scatter: more means an edge or a bend.
+const MORE_SCATTER_ERRORS: f64 = 1.2;
 /// Middle over largest eigenvalue below which a neighbourhood is a line and says nothing about the surface.
 const LINE: f64 = 0.02;
 
@@ -40,7 +45,7 @@ const LINE: f64 = 0.02;
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Number of nearest neighbours (the point included) for each plane, 4 to 128. Follows noise and edges from 10 to
-    /// 32 when not given.
+    /// 32, or 18 to 64 in noisy scans, when not given.
     pub neighbours: Option<usize>,
     /// Whether known scanner stations decide which side faces the void (else only the axis does).
     pub use_stations: bool,
@@ -225,7 +230,7 @@ pub fn estimate(
     let estimates = if profiles {
         profiles::estimate(points, axis, &geometry.spacing(), settings.neighbours)
     } else {
-        planes(points, settings.neighbours)
+        planes(points, geometry.spacing().along_m, settings.neighbours)
     };
     let mut normals: Vec<Vec3> = estimates.par_iter().map(|e| e.normal).collect();
     let viewpoints = if settings.use_stations { viewpoints } else { Viewpoints::unknown() };
@@ -280,20 +285,32 @@ pub fn unoriented(points: &[Vec3], neighbours: usize) -> Vec<Vec3> {
     })
 }
 
-fn planes(points: &[Vec3], neighbours: Option<usize>) -> Vec<Estimate> {
-    let sizes = neighbours.map_or(NEIGHBOURHOODS.to_vec(), |k| vec![k]);
+fn planes(points: &[Vec3], spacing_m: f64, neighbours: Option<usize>) -> Vec<Estimate> {
+    if let Some(k) = neighbours {
+        return planes_of(points, &[k]);
+    }
+    let estimates = planes_of(points, &NEIGHBOURHOODS);
+    let mut noises: Vec<f64> = estimates.iter().map(|e| f64::from(e.noise_m)).collect();
+    let noisy = median(&mut noises).is_some_and(|noise| noise > NOISY * spacing_m);
+    if noisy { planes_of(points, &NOISY_NEIGHBOURHOODS) } else { estimates }
+}
+
+/// Planes over the largest of the given neighbourhoods that is still flat.
+fn planes_of(points: &[Vec3], sizes: &[usize]) -> Vec<Estimate> {
     let most = sizes[sizes.len() - 1];
     for_each_neighbourhood(points, most, |i, found| {
         let mut scatter = Scatter::about(points[i]);
         let mut chosen: Option<(Plane, usize)> = None;
         let mut taken = 0;
-        for &size in &sizes {
+        for &size in sizes {
             let until = size.min(found.len());
             found[taken..until].iter().for_each(|n| scatter.add(&points[n.index as usize]));
             taken = until;
             let Some(plane) = scatter.plane() else { break };
-            let grows = chosen
-                .is_none_or(|(before, _)| before.roundness < LINE || plane.noise_m <= MORE_SCATTER * before.noise_m);
+            let grows = chosen.is_none_or(|(before, count)| {
+                let error = (2.0 * (count as f64 - 3.0).max(1.0)).sqrt().recip();
+                before.roundness < LINE || plane.noise_m <= (1.0 + MORE_SCATTER_ERRORS * error) * before.noise_m
+            });
             if !grows {
                 break;
             }
