@@ -59,7 +59,7 @@ pub struct Arguments {
     #[arg(long, value_name = "TEXT", default_value = "L")]
     left_text: String,
     /// What stands in the way, separated by commas; `none` for an empty tunnel.
-    #[arg(long, value_name = "LIST", value_enum, value_delimiter = ',', default_value = "duct,cables,vehicle")]
+    #[arg(long, value_name = "LIST", value_enum, value_delimiter = ',', default_value = "cables,vehicle")]
     furniture: Vec<FurnitureName>,
     /// Scanner stations, spread evenly.
     #[arg(long, value_name = "N", default_value_t = Recipe::default().stations)]

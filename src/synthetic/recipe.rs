@@ -120,7 +120,7 @@ impl Default for Recipe {
             roughness_m: 0.05,
             fractures: true,
             lettering: ["ADIT 12 R".into(), "L".into()],
-            furniture: vec![Kind::Duct, Kind::Cables, Kind::Vehicle],
+            furniture: vec![Kind::Cables, Kind::Vehicle],
             stations: 3,
             points: 300_000,
             noise_m: 0.002,
