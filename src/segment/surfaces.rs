@@ -29,6 +29,9 @@ const FRONT_IN_RADII: f64 = 0.06;
 /// A patch this far behind the wall around it belongs to a side room, in mean radii.
 const BEHIND_IN_RADII: f64 = 0.25;
 
+/// Width of the window that finds things standing out of the wall, and how far they do at least, in mean radii.
+const STAND_OUT_WINDOW_IN_RADII: f64 = 0.7;
+const STAND_OUT_IN_RADII: f64 = 0.13;
 /// A bench is at least this long and this wide, metres, and not higher than this share of the tunnel's height.
 const BENCH_LENGTH_M: f64 = 5.0;
 const BENCH_WIDTH_M: f64 = 0.25;
@@ -67,6 +70,20 @@ pub(super) fn classify(
     class: &mut [Class],
 ) -> (PatchCounts, Vec<f64>) {
     let (first, clusters) = split_cells(grid, cells);
+    let patch_of = join(grid, &first, &clusters);
+    // Things that touch the wall somewhere are in its patch: what stands out in front is taken away, then joined anew.
+    let standing_out = standing_out(grid, section, &first, &clusters, &patch_of, mean_radius);
+    for (c, _) in clusters.iter().zip(&standing_out).filter(|(_, out)| **out) {
+        let cell = c.cell as usize;
+        for (point, &index) in cells.in_cell(cell).iter().zip(cells.indices_in_cell(cell)) {
+            if point.depth >= c.low && point.depth <= c.high {
+                class[index as usize] = Class::Furniture;
+            }
+        }
+    }
+    let clusters: Vec<Cluster> =
+        clusters.into_iter().zip(&standing_out).filter(|(_, out)| !**out).map(|(c, _)| c).collect();
+    let first = first_of_cells(grid, &clusters);
     let patch_of = join(grid, &first, &clusters);
     let patches = patch_of.iter().copied().max().map_or(0, |m| m as usize + 1);
     let mut points = vec![0usize; patches];
@@ -141,12 +158,107 @@ fn split_cells(grid: &Grid, cells: &CellPoints) -> (Vec<u32>, Vec<Cluster>) {
         })
         .collect();
     let clusters: Vec<Cluster> = lists.into_iter().flatten().collect();
+    (first_of_cells(grid, &clusters), clusters)
+}
+
+/// First cluster of each cell, one more than there are cells.
+fn first_of_cells(grid: &Grid, clusters: &[Cluster]) -> Vec<u32> {
     let mut first = vec![0u32; grid.len() + 1];
     clusters.iter().for_each(|c| first[c.cell as usize + 1] += 1);
     for cell in 0..grid.len() {
         first[cell + 1] += first[cell];
     }
-    (first, clusters)
+    first
+}
+
+/// Clusters of the largest patch that stand out in front of it: narrow dents of the depth picture deeper than rock makes
+/// them. A morphological closing fills every dent narrower than its window; what it fills by more than
+/// [`STAND_OUT_IN_RADII`] is a core, and the thing is all that hangs together with a core and is filled by half of that.
+/// The lowest part of the section is left alone: kerbs and ballast are ground.
+fn standing_out(
+    grid: &Grid,
+    section: &SectionField,
+    first: &[u32],
+    clusters: &[Cluster],
+    patch_of: &[u32],
+    mean_radius: f64,
+) -> Vec<bool> {
+    let mut size = vec![0usize; patch_of.iter().max().map_or(0, |m| *m as usize + 1)];
+    clusters.iter().zip(patch_of).for_each(|(c, &p)| size[p as usize] += c.count as usize);
+    let Some(main) = (0..size.len()).max_by(|&a, &b| size[a].cmp(&size[b]).then(b.cmp(&a))) else {
+        return Vec::new();
+    };
+    let in_main = |k: usize| patch_of[k] as usize == main;
+    let range = |cell: usize| first[cell] as usize..first[cell + 1] as usize;
+    let far: Vec<f64> = (0..grid.len())
+        .map(|cell| range(cell).filter(|&k| in_main(k)).map(|k| clusters[k].middle).fold(f64::NEG_INFINITY, f64::max))
+        .collect();
+    let radius = STAND_OUT_WINDOW_IN_RADII * mean_radius / 2.0;
+    let rows = (radius / grid.row_m).floor() as usize;
+    let columns = ((radius / grid.column_m).floor() as usize).min(grid.columns / 4);
+    // A window of a rectangle is a window of rows after one of columns, and hardly differs from a disk here.
+    let extreme = |field: &[f64], pick: fn(f64, f64) -> f64, skip: f64| -> Vec<f64> {
+        let around: Vec<f64> = (0..grid.len())
+            .into_par_iter()
+            .map(|n| {
+                let (i, j) = (n / grid.columns, n % grid.columns);
+                (0..2 * columns + 1)
+                    .map(|d| field[i * grid.columns + (j + grid.columns + d - columns) % grid.columns])
+                    .filter(|v| v.is_finite())
+                    .fold(skip, pick)
+            })
+            .collect();
+        (0..grid.len())
+            .into_par_iter()
+            .map(|n| {
+                let (i, j) = (n / grid.columns, n % grid.columns);
+                (i.saturating_sub(rows)..(i + rows + 1).min(grid.rows))
+                    .map(|i| around[i * grid.columns + j])
+                    .filter(|v| v.is_finite())
+                    .fold(skip, pick)
+            })
+            .collect()
+    };
+    let closed = extreme(&extreme(&far, f64::max, f64::NEG_INFINITY), f64::min, f64::INFINITY);
+    let place = |cell: usize, depth: f64| {
+        let (row, column) = (cell / grid.columns, cell % grid.columns);
+        let chainage = grid.start + (row as f64 + 0.5) * grid.row_m;
+        let (left, right) = section.girth_range(chainage);
+        let girth = left + (right - left) * (column as f64 + 0.5) / grid.columns as f64;
+        let angle = section.angle_of_girth(chainage, girth);
+        (section.radius(chainage, angle) + depth) * angle.cos()
+    };
+    let (low, high) = (0..grid.len())
+        .filter(|&cell| far[cell].is_finite())
+        .map(|cell| place(cell, far[cell]))
+        .fold((f64::MAX, f64::MIN), |(l, h), up| (l.min(up), h.max(up)));
+    let ground = low + BENCH_HEIGHT_SHARE * (high - low);
+    let filled: Vec<f64> = clusters
+        .par_iter()
+        .enumerate()
+        .map(|(k, c)| {
+            let cell = c.cell as usize;
+            if !in_main(k) || !closed[cell].is_finite() || place(cell, c.middle) < ground {
+                return 0.0;
+            }
+            closed[cell] - c.middle
+        })
+        .collect();
+    let core = STAND_OUT_IN_RADII * mean_radius;
+    let mut out: Vec<bool> = filled.iter().map(|&f| f > core).collect();
+    let mut stack: Vec<usize> = (0..clusters.len()).filter(|&k| out[k]).collect();
+    while let Some(k) = stack.pop() {
+        let cell = clusters[k].cell as usize;
+        for n in std::iter::once(cell).chain(grid.neighbours(cell, 1)) {
+            for m in range(n) {
+                if !out[m] && filled[m] > core / 2.0 && step(&clusters[k], &clusters[m]).abs() <= MAX_STEP_M {
+                    out[m] = true;
+                    stack.push(m);
+                }
+            }
+        }
+    }
+    out
 }
 
 /// Step between two clusters: 0 when their depth ranges overlap; negative when `a` lies in front of `b`.
