@@ -19,11 +19,14 @@ pub struct Settings {
     pub max_gap_m: f64,
     /// Holes narrower than this are filled and marked as filled, metres; 0 fills none.
     pub fill_hole_m: f64,
+    /// The wall behind ducts, cables and other furniture is filled and marked where its shadow is narrower than this,
+    /// metres; 0 leaves holes.
+    pub fill_behind_furniture_m: f64,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { spacing_m: None, max_gap_m: 0.05, fill_hole_m: 0.3 }
+        Self { spacing_m: None, max_gap_m: 0.05, fill_hole_m: 0.3, fill_behind_furniture_m: 1.5 }
     }
 }
 
@@ -82,6 +85,7 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         spacing_m: settings.spacing_m,
         max_gap_m: settings.max_gap_m,
         fill_hole_m: settings.fill_hole_m,
+        fill_behind_furniture_m: settings.fill_behind_furniture_m,
     };
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
     let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
@@ -130,9 +134,12 @@ fn check(settings: &Settings) -> Result<(), Error> {
         let value = settings.max_gap_m;
         return Err(Error::Setting { key: "max_gap_m", value, must: "must be a positive number of metres" });
     }
-    if !(settings.fill_hole_m.is_finite() && settings.fill_hole_m >= 0.0) {
-        let value = settings.fill_hole_m;
-        return Err(Error::Setting { key: "fill_hole_m", value, must: "must be 0 or a positive number of metres" });
+    for (key, value) in
+        [("fill_hole_m", settings.fill_hole_m), ("fill_behind_furniture_m", settings.fill_behind_furniture_m)]
+    {
+        if !(value.is_finite() && value >= 0.0) {
+            return Err(Error::Setting { key, value, must: "must be 0 or a positive number of metres" });
+        }
     }
     Ok(())
 }

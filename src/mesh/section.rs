@@ -25,8 +25,8 @@ use super::repair;
 use super::{Mesh, VertexId};
 use crate::axis::Axis;
 use crate::numeric::{Mat3, Vec3, statistics};
-use crate::segment::Segmentation;
 use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint, squared_distance};
+use crate::segment::{Class, Segmentation};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -61,6 +61,7 @@ pub(super) struct Options {
     pub spacing_m: Option<f64>,
     pub max_gap_m: f64,
     pub fill_hole_m: f64,
+    pub fill_behind_furniture_m: f64,
 }
 
 /// What was done, for the report.
@@ -124,7 +125,14 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
     let mut places = fit_places(&grid, &cells, &clusters);
     drop(cells);
     let clusters = drop_bumps(&grid, clusters, &places, &mut summary);
-    let state = support(&grid, &clusters, &places, along_gap, options, &mut summary);
+    let mut furniture = vec![false; grid.len()];
+    for (c, _) in segmentation.coordinates.iter().zip(&segmentation.class).filter(|(_, k)| **k == Class::Furniture) {
+        let p = grid.unroll(section, c);
+        if p.row >= 0.0 && p.row < grid.rows as f64 {
+            furniture[p.row as usize * grid.columns + (p.column as usize).min(grid.columns - 1)] = true;
+        }
+    }
+    let state = support(&grid, &clusters, &places, &furniture, along_gap, options, &mut summary);
     fill_depths(&grid, &state, &mut places);
     // Between profiles whole rows have no points of their own; elsewhere a face needs a measured corner.
     let profiles = segmentation.sampling.is_profiles();
@@ -384,6 +392,7 @@ fn support(
     grid: &Grid,
     clusters: &[Cluster],
     places: &[GridPoint],
+    furniture: &[bool],
     along_gap: f64,
     options: &Options,
     summary: &mut Summary,
@@ -419,29 +428,39 @@ fn support(
             }
         })
         .collect();
-    // Closing: grow the surface by half the hole width, then shrink it back; what stays beyond was a narrow hole.
-    let radius = options.fill_hole_m / 2.0;
-    if radius > 0.0 {
-        // Stretch the metric of profile scans, so that a hole counts by its width around the section.
-        let scale = [grid.row_m * around_gap / along_gap, grid.column_m];
-        let margin = (radius / scale[0]).ceil() as usize + 2;
-        let rows = grid.rows + 2 * margin;
-        let mut present = vec![false; rows * grid.columns];
-        for (p, s) in present[margin * grid.columns..].iter_mut().zip(&state) {
-            *p = *s != Node::Absent;
-        }
-        let grown = squared_distance(&present, rows, grid.columns, scale);
-        let beyond: Vec<bool> = grown.iter().map(|d| *d > radius * radius).collect();
-        let back = squared_distance(&beyond, rows, grid.columns, scale);
-        for (s, d) in state.iter_mut().zip(&back[margin * grid.columns..]) {
-            if *s == Node::Absent && *d > radius * radius {
-                *s = Node::Filled;
-            }
-        }
+    // Stretch the metric of profile scans, so that a hole counts by its width around the section.
+    let scale = [grid.row_m * around_gap / along_gap, grid.column_m];
+    if options.fill_hole_m > 0.0 {
+        close(grid, &mut state, options.fill_hole_m / 2.0, scale, |_| true);
+    }
+    if options.fill_behind_furniture_m > options.fill_hole_m && furniture.iter().any(|f| *f) {
+        // The shadow lies beside the thing as well, so the fill reaches out from it.
+        let reach = options.fill_behind_furniture_m / 3.0;
+        let from_furniture = squared_distance(furniture, grid.rows, grid.columns, scale);
+        let near = |n: usize| from_furniture[n] <= reach * reach;
+        close(grid, &mut state, options.fill_behind_furniture_m / 2.0, scale, near);
     }
     summary.cells_bridged = state.iter().filter(|s| matches!(s, Node::Near | Node::Bridged)).count();
     summary.cells_filled = state.iter().filter(|s| **s == Node::Filled).count();
     state
+}
+
+/// Morphological closing: grows the surface by `radius`, shrinks it back, and fills what stays beyond where `allowed`.
+fn close(grid: &Grid, state: &mut [Node], radius: f64, scale: [f64; 2], allowed: impl Fn(usize) -> bool) {
+    let margin = (radius / scale[0]).ceil() as usize + 2;
+    let rows = grid.rows + 2 * margin;
+    let mut present = vec![false; rows * grid.columns];
+    for (p, s) in present[margin * grid.columns..].iter_mut().zip(state.iter()) {
+        *p = *s != Node::Absent;
+    }
+    let grown = squared_distance(&present, rows, grid.columns, scale);
+    let beyond: Vec<bool> = grown.iter().map(|d| *d > radius * radius).collect();
+    let back = squared_distance(&beyond, rows, grid.columns, scale);
+    for (n, (s, d)) in state.iter_mut().zip(&back[margin * grid.columns..]).enumerate() {
+        if *s == Node::Absent && *d > radius * radius && allowed(n) {
+            *s = Node::Filled;
+        }
+    }
 }
 
 /// Depths of bridged and filled nodes: a front of averages moves inwards, then a thin plate relaxes it.
@@ -651,7 +670,8 @@ mod tests {
         topology::boundary_loops(mesh.faces(), &topology::twins(mesh.faces()).unwrap()).len()
     }
 
-    const OPTIONS: Options = Options { spacing_m: Some(0.05), max_gap_m: 0.05, fill_hole_m: 0.2 };
+    const OPTIONS: Options =
+        Options { spacing_m: Some(0.05), max_gap_m: 0.05, fill_hole_m: 0.2, fill_behind_furniture_m: 0.0 };
 
     #[test]
     fn a_tube_becomes_a_tube_that_faces_inwards() {
