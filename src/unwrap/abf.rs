@@ -141,6 +141,8 @@ fn newton(problem: &AngleProblem, settings: &Settings, summary: &mut SolveSummar
         let solve_error = |what: String| Error::Solve { method: "abf", what };
         let matrix = SparseColMat::<usize, f64>::try_new_from_triplets(unknowns, unknowns, &entries)
             .map_err(|e| solve_error(format!("the system of {unknowns} unknowns cannot be built: {e:?}")))?;
+        // The bytes of a parallel factorization depend on the number of threads.
+        faer::set_global_parallelism(faer::Par::Seq);
         let factor =
             matrix.sp_lu().map_err(|e| solve_error(format!("the system of {unknowns} unknowns is singular: {e:?}")))?;
         let solution = factor.solve(faer::Mat::from_fn(unknowns, 1, |i, _| right[i]));

@@ -11,6 +11,14 @@ use nalgebra::{Rotation3, Unit};
 /// Vertex coordinates of charts that should be equal may differ by this much, metres: methods iterate.
 const SAME_M: f64 = 2e-5;
 
+/// Methods that deform in space or by bones and then project: approximate by nature, so they owe no exact isometry,
+/// placement or scaling; their own tests bound how far off they are.
+const APPROXIMATE: [&str; 2] = ["deform-arap", "deform-skin"];
+
+fn exact_methods() -> impl Iterator<Item = &'static str> {
+    Method::NAMES.iter().copied().filter(|m| !APPROXIMATE.contains(m))
+}
+
 fn chart(method: &str, strip: Strip, axis: &Axis) -> (Chart, Summary) {
     let settings = Settings { smoothing_m: Some(0.0), ..Settings::of(Method::named(method).unwrap()) };
     flatten(strip, Some(axis), &settings).unwrap_or_else(|e| panic!("{method}: {e}"))
@@ -32,7 +40,7 @@ fn largest_difference(a: &[Vec2], b: &[Vec2]) -> f64 {
 #[test]
 fn every_method_is_an_isometry_on_developable_surfaces() {
     for known in closed_form::developable() {
-        for method in Method::NAMES {
+        for method in exact_methods() {
             let (_, summary) = chart(method, known.strip.clone(), &known.axis);
             let stretch = summary.distortion.stretch.max;
             assert!(stretch < 1.0 + 1e-5, "{method} on the {}: {stretch}", known.name);
@@ -44,7 +52,7 @@ fn every_method_is_an_isometry_on_developable_surfaces() {
 #[test]
 fn every_method_places_its_chart_like_the_axis_says() {
     let known = closed_form::prism();
-    for method in Method::NAMES {
+    for method in exact_methods() {
         let (chart, _) = chart(method, known.strip.clone(), &known.axis);
         for (p, q) in chart.uv().iter().zip(&known.flat) {
             assert!((p - q).norm() < 1e-3, "{method}: {p} instead of {q}");
@@ -60,7 +68,7 @@ fn rough() -> Known {
 fn motion_of_the_input_leaves_the_chart_the_same_and_scale_scales_it() {
     let known = rough();
     let turn = Rotation3::from_axis_angle(&Unit::new_normalize(Vec3::z()), 0.7);
-    for method in Method::NAMES {
+    for method in exact_methods() {
         let (reference, _) = chart(method, known.strip.clone(), &known.axis);
         for scale in [1.0, 3.0] {
             let moved = |p: &Vec3| (turn * p) * scale + Vec3::new(20.0, -35.0, 4.0);

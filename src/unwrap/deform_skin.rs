@@ -220,16 +220,22 @@ impl Cage {
             let (along, around) = (1.0 / (self.step.x * self.step.x), 1.0 / (self.step.y * self.step.y));
             let mut row: Vec<(u32, f64)> = Vec::with_capacity(5);
             let mut middle = 0.0;
-            let mut add = |present: bool, at: u32, k: f64| {
-                if present {
-                    row.push((at, -k));
-                    middle += k;
-                }
+            let mut add = |at: u32, k: f64| {
+                row.push((at, -k));
+                middle += k;
             };
-            add(i > 0, node(i.wrapping_sub(1), j), along);
-            add(i + 1 < rows, node(i + 1, j), along);
-            add(j > 0, node(i, j.wrapping_sub(1)), around);
-            add(j + 1 < columns, node(i, j + 1), around);
+            if i > 0 {
+                add(node(i - 1, j), along);
+            }
+            if i + 1 < rows {
+                add(node(i + 1, j), along);
+            }
+            if j > 0 {
+                add(node(i, j - 1), around);
+            }
+            if j + 1 < columns {
+                add(node(i, j + 1), around);
+            }
             row.push((node(i, j), middle));
             row
         };
