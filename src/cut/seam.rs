@@ -3,7 +3,8 @@
 //! Use it on every tunnel mesh before flattening. Triangles that the line crosses are split, so the seam is straight on
 //! the map; vertices very near the line are taken for points of it, so no slivers arise. The seam is the cheapest edge
 //! path between the portals, where edges on the line are cheapest and crossing a hole costs its straight width
-//! (nothing needs cutting there). Where the surface hides behind itself as seen from the axis, or has steps, the path leaves the
+//! (nothing needs cutting there). A portal may be ragged or have a slit far into the tunnel; leaving through it costs as
+//! much as going on along the line to its outermost point, so a slit beside the line is no short cut. Where the surface hides behind itself as seen from the axis, or has steps, the path leaves the
 //! line as shortly as it can; how far is reported.
 //!
 //! Guarantees: the result is a [`Strip`] none of whose borders winds around the axis. Cost: linear, apart from sorting
@@ -184,6 +185,8 @@ struct Line {
     crossing: Vec<f64>,
     /// Distance of each vertex from the line around the section, metres.
     away: Vec<f64>,
+    /// Chainage of each vertex, metres.
+    chainage: Vec<f64>,
 }
 
 impl Line {
@@ -229,7 +232,8 @@ impl Line {
             }
         }
         let away = coordinates.iter().zip(&from_seam).map(|(c, a)| c.radius() * a.abs()).collect();
-        Self { side, crossing, away }
+        let chainage = coordinates.iter().map(|c| c.chainage).collect();
+        Self { side, crossing, away, chainage }
     }
 }
 
@@ -241,11 +245,14 @@ struct Split {
     on_line: Vec<bool>,
     /// Distance of a vertex from the line around the section, metres.
     away: Vec<f64>,
+    /// Chainage of a vertex, metres.
+    chainage: Vec<f64>,
 }
 
 fn split_along(mesh: Mesh, twin: &[u32], line: &Line, summary: &mut Summary) -> Split {
     let mut vertices = mesh.vertices().to_vec();
     let mut away = line.away.clone();
+    let mut chainage = line.chainage.clone();
     let mut on_line: Vec<bool> = line.side.iter().map(|&s| s == 0).collect();
     let mut middle = vec![u32::MAX; twin.len()];
     for (f, corners) in mesh.faces().iter().enumerate() {
@@ -255,9 +262,10 @@ fn split_along(mesh: Mesh, twin: &[u32], line: &Line, summary: &mut Summary) -> 
             if t.is_nan() || middle[half_edge] != u32::MAX {
                 continue;
             }
-            let (a, b) = (vertices[corners[i] as usize], vertices[corners[(i + 1) % 3] as usize]);
+            let (v, w) = (corners[i] as usize, corners[(i + 1) % 3] as usize);
             let id = vertices.len() as u32;
-            vertices.push(a + (b - a) * t);
+            vertices.push(vertices[v] + (vertices[w] - vertices[v]) * t);
+            chainage.push(chainage[v] + (chainage[w] - chainage[v]) * t);
             on_line.push(true);
             away.push(0.0);
             middle[half_edge] = id;
@@ -278,7 +286,7 @@ fn split_along(mesh: Mesh, twin: &[u32], line: &Line, summary: &mut Summary) -> 
     summary.added_vertices += vertices.len() - mesh.vertices().len();
     let mesh = Mesh::new(vertices, faces, observed).expect("splitting edges keeps a manifold");
     let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
-    Split { mesh, twin, on_line, away }
+    Split { mesh, twin, on_line, away, chainage }
 }
 
 /// The parts of a face whose edges are split where `mid` (for the edge leaving each corner) names a vertex.
@@ -343,9 +351,21 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
     } else {
         None
     };
-    let arrived = |v: u32| match pole {
-        Some(pole) => v == pole,
-        None => loop_of[v as usize] == portals[1] as u32,
+    // Leaving or entering away from a portal's outermost point costs the way to it, as if the seam went on outside.
+    let middle = |l: &[u32]| l.iter().map(|&v| split.chainage[v as usize]).sum::<f64>() / l.len() as f64;
+    let start_middle = middle(&loops[start_loop]);
+    let end_middle = pole.map_or_else(|| middle(&loops[portals[1]]), |pole| split.chainage[pole as usize]);
+    let outermost = |l: &[u32], low: bool| {
+        let ends = l.iter().map(|&v| split.chainage[v as usize]);
+        if low { ends.fold(f64::INFINITY, f64::min) } else { ends.fold(f64::NEG_INFINITY, f64::max) }
+    };
+    let start_chainage = outermost(&loops[start_loop], start_middle <= end_middle);
+    let end_chainage = portals.get(1).map(|&end| outermost(&loops[end], end_middle < start_middle));
+    let detour = |v: u32, portal: f64| (split.chainage[v as usize] - portal).abs() + split.away[v as usize];
+    // What is still to be paid at a vertex where the seam may end.
+    let leaves = |v: u32| match end_chainage {
+        Some(end) => (loop_of[v as usize] == portals[1] as u32).then(|| detour(v, end)),
+        None => (Some(v) == pole).then_some(0.0),
     };
 
     // Inner half-edges leaving each vertex, in compressed rows.
@@ -385,19 +405,25 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
     // Distances are not negative, so their bit patterns order like the numbers.
     let mut heap: BinaryHeap<Reverse<(u64, u32)>> = BinaryHeap::new();
     for &v in &loops[start_loop] {
-        distance[v as usize] = 0.0;
-        heap.push(Reverse((0, v)));
+        distance[v as usize] = detour(v, start_chainage);
+        heap.push(Reverse((distance[v as usize].to_bits(), v)));
     }
-    let mut end = None;
+    let mut end: Option<(f64, u32)> = None;
     while let Some(Reverse((_, v))) = heap.pop() {
         if std::mem::replace(&mut done[v as usize], true) {
             continue;
         }
-        if arrived(v) {
-            end = Some(v);
+        let here = distance[v as usize];
+        if end.is_some_and(|(least, _)| least <= here) {
             break;
         }
-        let here = distance[v as usize];
+        if let Some(rest) = leaves(v) {
+            // A seam that touched the portal and went on would cut off what lies between.
+            if end.is_none_or(|(least, _)| here + rest < least) {
+                end = Some((here + rest, v));
+            }
+            continue;
+        }
         let hole = loop_of[v as usize];
         if hole != NO_LOOP && !std::mem::replace(&mut entered[hole as usize], true) {
             for &w in &loops[hole as usize] {
@@ -414,7 +440,7 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
         for &c in &leaving[first[v as usize] as usize..first[v as usize + 1] as usize] {
             let w = vertex(topology::next(c)) as usize;
             let there = here + cost(c);
-            if there < distance[w] {
+            if loop_of[w] != start_loop as u32 && there < distance[w] {
                 distance[w] = there;
                 came[w] = Came::Edge(c);
                 heap.push(Reverse((there.to_bits(), w as u32)));
@@ -422,7 +448,7 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
         }
     }
     let mut path = Vec::new();
-    let mut at = end;
+    let mut at = end.map(|(_, v)| v);
     while let Some(v) = at {
         at = match came[v as usize] {
             Came::Start => None,
@@ -561,6 +587,23 @@ mod tests {
         let (strip, summary) = open(mesh, &axis, &Settings::default()).unwrap();
         assert_eq!((summary.holes_crossed, summary.holes_left), (1, 0));
         assert!(summary.seam_length_m < 6.5 && strip.hole_loops().is_empty());
+    }
+
+    #[test]
+    fn a_slit_that_reaches_far_into_the_tunnel_beside_the_line_is_no_short_cut() {
+        // Open along the right foot of the wall over 60 % of the length, out of either portal.
+        for from_the_end in [true, false] {
+            let slit = |s: f64, angle: f64| {
+                let inside = if from_the_end { s > 4.0 } else { s < 6.0 };
+                !(inside && (2.3..2.45).contains(&angle))
+            };
+            let (mesh, axis) = tube(80, 120, slit, smooth);
+            let area = mesh.area();
+            let (strip, summary) = open(mesh, &axis, &Settings::default()).unwrap();
+            assert!((strip.mesh().area() - area).abs() < 1e-9);
+            assert_eq!((summary.off_line_m, summary.holes_left), (0.0, 0), "{summary:?}");
+            assert!((10.0..10.4).contains(&summary.seam_length_m), "{}", summary.seam_length_m);
+        }
     }
 
     #[test]

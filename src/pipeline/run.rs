@@ -30,7 +30,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "axis", version: 1, needs: &["clean"] },
     Stage { name: "segment", version: 1, needs: &["clean", "axis"] },
     Stage { name: "mesh", version: 1, needs: &["segment", "axis"] },
-    Stage { name: "cut", version: 1, needs: &["mesh", "axis"] },
+    Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 1, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 1, needs: &["anchor", "unwrap", "mesh", "ingest"] },
@@ -42,7 +42,7 @@ pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 1, needs: &["ingest"] },
     Stage { name: "mesh", version: 1, needs: &["ingest", "axis"] },
-    Stage { name: "cut", version: 1, needs: &["mesh", "axis"] },
+    Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
     Stage { name: "map", version: 1, needs: &["unwrap", "mesh", "ingest"] },
 ];
