@@ -18,7 +18,7 @@
 //! Handles are the vertices next to a regular lattice of the section chart. They move from the straightened tunnel
 //! (closed form) to the map in `opening_steps` steps, each followed by a local (rotations) and a global step (solve). Then
 //! all heights are pressed to zero and the map relaxes in its plane, the automatic handles being weak springs that keep it
-//! from wandering. There every fan is at rest unrolled ([`super::fans`]): with fans as bent as the rock the plane is never
+//! from wandering. There every fan is at rest unrolled (`fans.rs`): with fans as bent as the rock the plane is never
 //! at rest, and not even a cylinder would open to its flat form.
 //!
 //! Guarantees: finite; an isometry on developable surfaces; flips left at the end are unfolded and counted. Needs the axis.

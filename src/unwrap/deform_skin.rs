@@ -12,7 +12,7 @@
 //! | `w_b` | weight of bone `b`, between 0 and 1, 1 on the bone, 0 on the others |
 //! | `c_b(u)`, `theta_b(u)` | place of bone `b` in the section at chainage `u`, and its direction there |
 //!
-//! The bend is taken out first in closed form (chainage, right, down). The cage ([`super::cage`]) is a regular grid over the
+//! The bend is taken out first in closed form (chainage, right, down). The cage (`cage.rs`) is a regular grid over the
 //! section chart; it carries the mean section, a smooth field fitted to the vertices, and the weights. Bones run along the
 //! tunnel: the crown, the two ends, and outwards from the crown a new one whenever the section has turned by
 //! `bone_turn_deg`, which puts bones on springlines and wall lines. Each bone is a chain of rigid transforms: at chainage
