@@ -58,6 +58,14 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let strip = Strip::from_disk(mesh).map_err(|e| bad(e.into()))?;
     let chart = Chart::new(strip, uv).map_err(|e| bad(e.into()))?;
     let measured = measure(&chart, &places);
+    if measured.map_m == 0.0 {
+        return Err(usage("the places are one and the same: there is no length to measure".to_owned()));
+    }
+    if measured.without_surface_m >= measured.map_m {
+        let text =
+            "no part of the line lies on the map; places are chainage,girth in metres, and the crown is at girth 0";
+        return Err(usage(text.to_owned()));
+    }
     if json {
         let report = serde_json::json!({
             "map_m": measured.map_m,
@@ -119,6 +127,33 @@ fn measure(chart: &Chart, places: &[Vec2]) -> Measured {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::unwrap::closed_form;
+
+    #[test]
+    fn a_cylinder_keeps_its_lengths_around_and_along() {
+        let known = closed_form::full_cylinder();
+        let chart = Chart::new(known.strip, known.flat).unwrap();
+        for [a, b] in [[(0.3, -11.0), (0.3, 11.0)], [(0.5, 2.0), (8.5, 2.0)], [(1.0, -8.0), (8.0, 9.0)]] {
+            let measured = measure(&chart, &[Vec2::new(a.0, a.1), Vec2::new(b.0, b.1)]);
+            let ratio = measured.surface_m / measured.map_m;
+            assert!((ratio - 1.0).abs() < 1e-4 && measured.without_surface_m == 0.0, "{a:?} {b:?}: {ratio}");
+        }
+    }
+
+    #[test]
+    fn a_chainage_map_of_a_bend_is_off_by_radius_over_bend_radius() {
+        // A circular tunnel of 3 m on a left-hand bend of 20 m: the right wall is the outer one.
+        let known = closed_form::bend(20.0);
+        let chart = Chart::new(known.strip, known.flat).unwrap();
+        let quarter = 1.5 * std::f64::consts::PI;
+        for (girth, expected) in [(0.0, 1.0), (quarter, 23.0 / 20.0), (-quarter, 17.0 / 20.0)] {
+            let measured = measure(&chart, &[Vec2::new(2.0, girth), Vec2::new(30.0, girth)]);
+            let ratio = measured.surface_m / measured.map_m;
+            assert!((ratio - expected).abs() < 2e-3, "at girth {girth}: {ratio} instead of {expected}");
+        }
+        let around = measure(&chart, &[Vec2::new(15.0, -6.0), Vec2::new(15.0, 6.0)]);
+        assert!((around.surface_m / around.map_m - 1.0).abs() < 2e-3);
+    }
 
     #[test]
     fn a_sheet_on_a_slope_is_longer_than_its_plan() {

@@ -15,6 +15,7 @@ Examples:
   adit unwrap tunnel.ply --out flat.ply                     the default method; finds the axis by itself
   adit unwrap tunnel.ply --method slim --out flat.ply       any mesh of disk topology, no axis needed
   adit unwrap tunnel.ply --method relax --set straightness=0.9 --axis axis.csv --out flat.ply
+  adit unwrap tunnel.ply --method deform-arap --set 'handles=\"handles.csv\"' --out flat.ply
   adit unwrap tunnel.ply --method section --json --out flat.ply | jq .stretch.mean";
 
 /// A border this long, compared with the longest, is a second portal rather than a hole.
@@ -67,12 +68,24 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         cut.warnings.iter().for_each(|w| console.warn(&w.message));
     }
     let open_seconds = started.elapsed().as_secs_f64() - read_seconds;
-    let (chart, summary) = unwrap::flatten(strip, axis.as_ref(), &settings).map_err(|e| {
+    let handles = match settings.method.handles_file() {
+        Some(path) => {
+            let text =
+                std::fs::read_to_string(path).with_context(|| format!("cannot read the handles {}", path.display()));
+            let text = text.map_err(bad_mesh)?;
+            unwrap::handles::import_csv(&text, &path.display().to_string(), &frame)
+                .map_err(|e| Failure::new(Exit::BadInput, e))?
+        }
+        None => Vec::new(),
+    };
+    let cpu_before = cpu_seconds();
+    let (chart, summary) = unwrap::flatten_with_handles(strip, axis.as_ref(), &handles, &settings).map_err(|e| {
         let exit = if matches!(e, unwrap::Error::Setting { .. }) { Exit::Usage } else { Exit::BadInput };
         Failure { exit, error: anyhow::Error::new(e).context(format!("{name} was not flattened")) }
     })?;
     summary.warnings.iter().for_each(|w| console.warn(&w.message));
     let flatten_seconds = started.elapsed().as_secs_f64() - read_seconds - open_seconds;
+    let flatten_cpu_seconds = cpu_seconds().zip(cpu_before).map(|(after, before)| after - before);
 
     let mesh = chart.strip().mesh();
     let observed = mesh.observed_vertices();
@@ -91,7 +104,8 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         report["faces"] = mesh.faces().len().into();
         report["cut"] = serde_json::to_value(&cut).map_err(|e| Failure::new(Exit::Internal, e))?;
         report["seconds"] = serde_json::json!({
-            "read": read_seconds, "open": open_seconds, "flatten": flatten_seconds, "all": seconds
+            "read": read_seconds, "open": open_seconds, "flatten": flatten_seconds, "all": seconds,
+            "flatten_cpu": flatten_cpu_seconds,
         });
         if let Some(peak) = peak_memory_mib() {
             report["peak_memory_mib"] = peak.into();
@@ -174,6 +188,17 @@ fn peak_memory_mib() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
     Some((line.trim().trim_end_matches("kB").trim().parse::<f64>().ok()? / 1024.0).round())
+}
+
+/// Processor time of this process so far, all threads together, where the system tells (Linux).
+fn cpu_seconds() -> Option<f64> {
+    /// The kernel counts in hundredths of a second whatever its own clock does.
+    const TICKS_PER_SECOND: f64 = 100.0;
+    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The second field, the name, may hold blanks; it ends with the last parenthesis.
+    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks = |field: usize| fields.get(field)?.parse::<f64>().ok();
+    Some((ticks(11)? + ticks(12)?) / TICKS_PER_SECOND)
 }
 
 /// Writes under a temporary name first, so that a killed process leaves no half a file under the final one.

@@ -7,6 +7,7 @@
 
 mod blend;
 mod color_ramp;
+mod distortion_plot;
 mod draw;
 mod grid;
 mod layer;
@@ -21,6 +22,7 @@ pub(crate) mod example;
 
 pub use blend::Support;
 pub use color_ramp::{Ramp, label_color};
+pub use distortion_plot::distortion_histogram;
 pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, automatic_max_offset_m, draw};
 pub use grid::{Grid, PixelRect, Placement, TILE_PX, automatic_cell_m};
 pub use layer::{

@@ -18,5 +18,5 @@ pub mod settings;
 pub use error::{Error, Kind};
 pub use explain::Explanation;
 pub use line::{Observer, Stage, reset_peak_memory};
-pub use run::{MESH_STAGES, Outcome, Redo, STAGES, explain, run};
+pub use run::{MESH_STAGES, Outcome, Redo, STAGES, axis_csv, explain, is_mesh, run, run_to_surface};
 pub use settings::Pipeline;

@@ -48,6 +48,7 @@ pub(super) fn page(report: &Value, folder: &Path, axis_csv: &str) -> String {
     html.push_str("<h2>Where the map is good</h2>\n");
     figure(&mut html, folder, "map/coverage.png", "Coverage: observed, filled, and no surface.");
     figure(&mut html, folder, "map/distortion.png", "Distortion: greatest stretch between surface and map.");
+    drawing(&mut html, folder, "map/distortion_histogram.svg", "Length factors of the map, by share of the surface.");
     quantiles(&mut html, report);
     figure(&mut html, folder, "map/offset.png", "Distance from the local mean section: rock towards the void is red.");
     profiles(&mut html, report);
@@ -72,6 +73,14 @@ fn figure(html: &mut String, folder: &Path, name: &str, caption: &str) {
             "<figure><img alt=\"{alternative}\" src=\"data:image/png;base64,{}\"><figcaption>{alternative}</figcaption></figure>",
             base64(&png)
         );
+    }
+}
+
+/// A drawing that is text: part of the page as it is, but for the name of its language, which is an address.
+fn drawing(html: &mut String, folder: &Path, name: &str, caption: &str) {
+    if let Ok(svg) = std::fs::read_to_string(folder.join(name)) {
+        let svg = svg.replace(" xmlns=\"http://www.w3.org/2000/svg\"", "");
+        let _ = writeln!(html, "<figure>{}<figcaption>{}</figcaption></figure>", svg.trim_end(), escape(caption));
     }
 }
 

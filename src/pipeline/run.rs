@@ -31,9 +31,9 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "segment", version: 1, needs: &["clean", "axis"] },
     Stage { name: "mesh", version: 1, needs: &["segment", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
-    Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
+    Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 1, needs: &["unwrap", "ingest"] },
-    Stage { name: "map", version: 1, needs: &["anchor", "unwrap", "mesh", "ingest"] },
+    Stage { name: "map", version: 2, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
 ];
 
@@ -43,8 +43,8 @@ pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "axis", version: 1, needs: &["ingest"] },
     Stage { name: "mesh", version: 1, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
-    Stage { name: "unwrap", version: 1, needs: &["cut", "axis"] },
-    Stage { name: "map", version: 1, needs: &["unwrap", "mesh", "ingest"] },
+    Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
+    Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
 ];
 
 /// Distance between the lines of `axis.csv`, metres.
@@ -123,6 +123,8 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
     let input_hashes = hash_inputs(&pipeline.input)?;
     let alignment_hash = hash_inputs(pipeline.axis.alignment.as_slice())?;
     let poses_hash = hash_inputs(pipeline.ingest.poses.as_slice())?;
+    let handles_file = pipeline.unwrap.method.handles_file();
+    let handles_hash = hash_inputs(handles_file.map(std::slice::from_ref).unwrap_or_default())?;
     let from_mesh = is_mesh(&pipeline.input)?;
     let stages = if from_mesh { MESH_STAGES } else { STAGES };
     let plans = line::plan(
@@ -134,6 +136,7 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
                 input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone())).chain(poses).collect()
             }
             "axis" => alignment_hash.iter().map(|h| ("alignment".to_owned(), h.clone())).collect(),
+            "unwrap" => handles_hash.iter().map(|h| ("handles".to_owned(), h.clone())).collect(),
             _ => BTreeMap::new(),
         },
     );
@@ -159,13 +162,32 @@ pub fn run(pipeline: &Pipeline, out: &Path, redo: &Redo, observer: &dyn Observer
     if from_mesh {
         run_mesh(pipeline, &line)?;
     } else {
-        run_scan(pipeline, &line)?;
+        run_scan(pipeline, &line, Until::End)?;
     }
     report::finish(pipeline, &line, &folder, &input_hashes)
 }
 
+/// Runs the pipeline of a scan in a run folder as far as the surface: afterwards the folder holds `mesh.ply` and
+/// `axis.csv`.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_to_surface(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<(), Error> {
+    let plans = prepare(pipeline)?.plans;
+    let folder = RunFolder::open(out)?;
+    folder.refuse_inputs_inside(&pipeline.input, &["mesh.ply"])?;
+    run_scan(pipeline, &Line::new(&folder, observer, plans), Until::Surface)
+}
+
+/// How far a run goes.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Until {
+    Surface,
+    End,
+}
+
 /// From a scan to everything.
-fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error> {
+fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Result<(), Error> {
     let cloud = line.passing("ingest", |_| done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest)));
     let cleaned = line.passing("clean", |_| done("clean", clean::clean(&*cloud.get()?, &pipeline.clean)));
     let axis = line.product("axis", |staging| {
@@ -187,6 +209,10 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
         Ok((Surface { mesh, section: segmentation.section.clone() }, summary))
     });
+    if until == Until::Surface {
+        axis.ensure()?;
+        return surface.ensure();
+    }
     let strip = line.passing("cut", |_| {
         let mesh = surface.get()?.mesh.clone();
         segmentation.release();
@@ -194,7 +220,9 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
     });
     let chart = line.product("unwrap", |staging| {
         let axis = axis.get()?;
-        let (chart, summary) = done("unwrap", unwrap::flatten(strip.take()?, Some(&axis), &pipeline.unwrap))?;
+        let handles = read_handles(pipeline, cloud.get()?.frame())?;
+        let (chart, summary) =
+            done("unwrap", unwrap::flatten_with_handles(strip.take()?, Some(&axis), &handles, &pipeline.unwrap))?;
         write_ply("unwrap", &staging.join("chart.ply"), cloud.get()?.frame(), chart.strip().mesh(), Some(chart.uv()))?;
         Ok((chart, summary))
     });
@@ -271,7 +299,9 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
         line.passing("cut", |_| done("cut", cut::open(surface.get()?.mesh.clone(), &*axis.get()?, &pipeline.cut)));
     let chart = line.product("unwrap", |staging| {
         let axis = axis.get()?;
-        let (chart, summary) = done("unwrap", unwrap::flatten(strip.take()?, Some(&axis), &pipeline.unwrap))?;
+        let handles = read_handles(pipeline, &raw.get()?.frame)?;
+        let (chart, summary) =
+            done("unwrap", unwrap::flatten_with_handles(strip.take()?, Some(&axis), &handles, &pipeline.unwrap))?;
         write_ply("unwrap", &staging.join("chart.ply"), &raw.get()?.frame, chart.strip().mesh(), Some(chart.uv()))?;
         Ok((chart, summary))
     });
@@ -301,6 +331,14 @@ fn find_axis(pipeline: &Pipeline, points: &[Vec3], frame: &ScanFrame) -> Result<
     }
 }
 
+/// The handles of the file that the settings of the unwrap method name; none when they name none.
+fn read_handles(pipeline: &Pipeline, frame: &ScanFrame) -> Result<Vec<unwrap::Handle>, Error> {
+    let Some(path) = pipeline.unwrap.method.handles_file() else { return Ok(Vec::new()) };
+    let text = std::fs::read_to_string(path)
+        .map_err(|source| Error::in_stage("unwrap")(io::Error::Read { path: path.clone(), source }))?;
+    unwrap::handles::import_csv(&text, &path.display().to_string(), frame).map_err(Error::in_stage("unwrap"))
+}
+
 /// Draws all layers and the overview into the folder `map` of the staging folder.
 fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Result<((), serde_json::Value), Error> {
     let folder = staging.join("map");
@@ -310,11 +348,16 @@ fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Resu
     let picture = map::overview(input, &pipeline.map, &summary).map_err(Error::in_stage("map"))?;
     io::write_picture(&folder.join("map.png"), &picture)
         .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))?;
+    let faces = unwrap::distortion::of_faces(input.chart.strip().mesh(), input.chart.uv());
+    write_text("map", &folder.join("distortion_histogram.svg"), &map::distortion_histogram(&faces))?;
     Ok(((), section(&summary)))
 }
 
 /// Whether the input is a mesh. Several files, one of them a mesh, make no sense together.
-fn is_mesh(inputs: &[PathBuf]) -> Result<bool, Error> {
+///
+/// # Errors
+/// [`Error::SeveralMeshes`].
+pub fn is_mesh(inputs: &[PathBuf]) -> Result<bool, Error> {
     let extension = |p: &PathBuf| p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     let meshes = inputs.iter().filter(|path| match extension(path).as_str() {
         "obj" | "off" | "stl" | "glb" => true,
@@ -420,7 +463,7 @@ fn section_offsets(mesh: &Mesh, axis: &Axis, section: &SectionField) -> Vec<f64>
 }
 
 /// The axis as `axis.csv`, scan coordinates.
-fn axis_csv(axis: &Axis, frame: &ScanFrame) -> String {
+pub fn axis_csv(axis: &Axis, frame: &ScanFrame) -> String {
     let mut text = String::from("chainage_m,x,y,z,azimuth_deg,gradient_percent\n");
     let steps = (axis.length() / AXIS_CSV_STEP_M).floor() as usize;
     let mut chainages: Vec<f64> = (0..=steps).map(|i| axis.start_chainage() + i as f64 * AXIS_CSV_STEP_M).collect();

@@ -91,7 +91,8 @@ impl Pipeline {
         let mut pipeline = Self::parse(&text, &path.display().to_string(), overrides)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         let more = [&mut pipeline.axis.alignment, &mut pipeline.ingest.poses];
-        for named in pipeline.input.iter_mut().chain(more.into_iter().flatten()) {
+        let handles = pipeline.unwrap.method.handles_file_mut();
+        for named in pipeline.input.iter_mut().chain(more.into_iter().flatten()).chain(handles) {
             *named = folder.join(&*named);
         }
         pipeline.make_inputs_absolute();
@@ -146,7 +147,8 @@ impl Pipeline {
     /// Replaces relative input paths by absolute ones, so that the resolved pipeline means the same everywhere.
     pub fn make_inputs_absolute(&mut self) {
         let more = [&mut self.axis.alignment, &mut self.ingest.poses];
-        for input in self.input.iter_mut().chain(more.into_iter().flatten()) {
+        let handles = self.unwrap.method.handles_file_mut();
+        for input in self.input.iter_mut().chain(more.into_iter().flatten()).chain(handles) {
             // Only an empty path or a vanished working folder has no absolute form; reading it will say so.
             if let Ok(absolute) = std::path::absolute(&*input) {
                 *input = absolute.components().collect();
@@ -339,10 +341,12 @@ mod tests {
     fn paths_are_relative_to_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("p.toml");
-        std::fs::write(&file, "input = ['scan.laz']\n[axis]\nalignment = 'axis.csv'\n").unwrap();
+        let text = "input = ['scan.laz']\n[axis]\nalignment = 'axis.csv'\n[unwrap.deform-skin]\nhandles = 'h.csv'\n";
+        std::fs::write(&file, text).unwrap();
         let pipeline = Pipeline::load(&file, &[]).unwrap();
         assert_eq!(pipeline.input, [folder.path().join("scan.laz")]);
         assert_eq!(pipeline.axis.alignment, Some(folder.path().join("axis.csv")));
+        assert_eq!(pipeline.unwrap.method.handles_file(), Some(&folder.path().join("h.csv")));
     }
 
     #[test]

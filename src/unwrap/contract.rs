@@ -11,12 +11,12 @@ use nalgebra::{Rotation3, Unit};
 /// Vertex coordinates of charts that should be equal may differ by this much, metres: methods iterate.
 const SAME_M: f64 = 2e-5;
 
-/// Methods that deform in space or by bones and then project: approximate by nature, so they owe no exact isometry,
-/// placement or scaling; their own tests bound how far off they are.
-const APPROXIMATE: [&str; 2] = ["deform-arap", "deform-skin"];
+/// Blended bones are approximate by nature: no exact isometry, and places within this much of the girth. Everything else
+/// in the contract they owe like the others; their own tests bound how far off they are.
+const APPROXIMATE: [(&str, f64); 1] = [("deform-skin", 0.01)];
 
 fn exact_methods() -> impl Iterator<Item = &'static str> {
-    Method::NAMES.iter().copied().filter(|m| !APPROXIMATE.contains(m))
+    Method::NAMES.iter().copied().filter(|m| APPROXIMATE.iter().all(|(name, _)| name != m))
 }
 
 fn chart(method: &str, strip: Strip, axis: &Axis) -> (Chart, Summary) {
@@ -52,10 +52,12 @@ fn every_method_is_an_isometry_on_developable_surfaces() {
 #[test]
 fn every_method_places_its_chart_like_the_axis_says() {
     let known = closed_form::prism();
-    for method in exact_methods() {
+    let girth = known.flat[known.flat.len() - 1].y - known.flat[0].y;
+    for method in Method::NAMES {
         let (chart, _) = chart(method, known.strip.clone(), &known.axis);
+        let off = APPROXIMATE.iter().find(|(name, _)| name == method).map_or(1e-3, |(_, share)| share * girth);
         for (p, q) in chart.uv().iter().zip(&known.flat) {
-            assert!((p - q).norm() < 1e-3, "{method}: {p} instead of {q}");
+            assert!((p - q).norm() < off, "{method}: {p} instead of {q}");
         }
     }
 }
@@ -68,7 +70,7 @@ fn rough() -> Known {
 fn motion_of_the_input_leaves_the_chart_the_same_and_scale_scales_it() {
     let known = rough();
     let turn = Rotation3::from_axis_angle(&Unit::new_normalize(Vec3::z()), 0.7);
-    for method in exact_methods() {
+    for method in Method::NAMES {
         let (reference, _) = chart(method, known.strip.clone(), &known.axis);
         for scale in [1.0, 3.0] {
             let moved = |p: &Vec3| (turn * p) * scale + Vec3::new(20.0, -35.0, 4.0);

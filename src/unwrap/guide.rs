@@ -1,6 +1,7 @@
 //! The guide: what the axis tells about a strip before any method runs. Where each vertex is along and around the
 //! tunnel, and the section chart that the methods start from, are placed on and are judged by.
 
+use super::handles::Handle;
 use super::{Error, section, unfold};
 use crate::axis::{Axis, AxisCoordinates};
 use crate::cut::Strip;
@@ -18,6 +19,7 @@ pub struct Guide {
     coordinates: Vec<AxisCoordinates>,
     angles: Vec<f64>,
     uv: Vec<Vec2>,
+    handles: Vec<Handle>,
     summary: GuideSummary,
 }
 
@@ -81,7 +83,17 @@ impl Guide {
             ambiguous_edges,
             warnings,
         };
-        Ok(Self { axis: axis.clone(), coordinates, angles, uv, summary })
+        Ok(Self { axis: axis.clone(), coordinates, angles, uv, handles: Vec::new(), summary })
+    }
+
+    /// The same guide with handles given by a person.
+    pub fn with_handles(self, handles: &[Handle]) -> Self {
+        Self { handles: handles.to_vec(), ..self }
+    }
+
+    /// Handles given by a person, for the methods that can be steered.
+    pub fn handles(&self) -> &[Handle] {
+        &self.handles
     }
 
     /// The axis.

@@ -11,6 +11,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::{Error as _, MapAccess, Visitor};
 use serde::ser::SerializeMap;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::path::PathBuf;
 
 /// What a method leaves undecided about its result; registration decides it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,10 +55,9 @@ macro_rules! methods {
                 match self { $(Self::$variant(_) => Freedom::$freedom,)+ }
             }
 
-            /// Whether the method cannot do without the tunnel axis: those that place their result themselves, and those
-            /// that open the tunnel in space.
+            /// Whether the method cannot do without the tunnel axis: it places its result itself.
             pub fn needs_axis(&self) -> bool {
-                self.freedom() == Freedom::Placed || self.name().starts_with("deform-")
+                self.freedom() == Freedom::Placed
             }
 
             /// Map coordinates of each vertex, not yet registered.
@@ -84,6 +84,26 @@ macro_rules! methods {
             }
         }
     };
+}
+
+impl Method {
+    /// The file with handles that the method's settings name, if they do.
+    pub fn handles_file(&self) -> Option<&PathBuf> {
+        match self {
+            Self::DeformArap(settings) => settings.handles.as_ref(),
+            Self::DeformSkin(settings) => settings.handles.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// The same, to be changed: paths in a pipeline file are relative to it.
+    pub fn handles_file_mut(&mut self) -> Option<&mut PathBuf> {
+        match self {
+            Self::DeformArap(settings) => settings.handles.as_mut(),
+            Self::DeformSkin(settings) => settings.handles.as_mut(),
+            _ => None,
+        }
+    }
 }
 
 impl Serialize for Method {
@@ -160,7 +180,7 @@ methods! {
     /// Scalable locally injective map: never a flip, mild worst triangles.
     Slim(slim) = "slim", Rigid;
     /// As-rigid-as-possible deformation in space, then projection.
-    DeformArap(deform_arap) = "deform-arap", Rigid;
+    DeformArap(deform_arap) = "deform-arap", Placed;
     /// Bones that open the tunnel like a book, then projection.
-    DeformSkin(deform_skin) = "deform-skin", Rigid;
+    DeformSkin(deform_skin) = "deform-skin", Placed;
 }

@@ -7,13 +7,16 @@ pub mod abf;
 pub mod abf_plus_plus;
 mod angles;
 pub mod arap;
+mod cage;
 mod conformal;
 pub mod chart_index;
 pub mod deform_arap;
 pub mod deform_skin;
 pub mod distortion;
+mod fans;
 mod finish;
 pub mod guide;
+pub mod handles;
 pub mod lscm;
 pub mod method;
 mod opening;
@@ -35,6 +38,7 @@ mod contract;
 pub use chart_index::{ChartIndex, RoundTrip, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
+pub use handles::Handle;
 pub use method::{Freedom, Method};
 pub use readability::Readability;
 
@@ -98,6 +102,20 @@ pub enum Error {
         vertex: u32,
         /// By how many turns they disagree.
         turns: f64,
+    },
+    /// A file with handles, or one of its handles, cannot be used.
+    #[error("{given_in}: {problem}")]
+    Handles {
+        /// File and line.
+        given_in: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// The settings name a file with handles, and the caller did not read it.
+    #[error("the handles of '{}' were not read", path.display())]
+    HandlesNotRead {
+        /// The file.
+        path: std::path::PathBuf,
     },
     /// A linear system could not be solved.
     #[error("method '{method}': {what}")]
@@ -309,6 +327,23 @@ pub struct Summary {
 /// [`Error::NeedsAxis`] for methods that cannot do without, [`Error::NotOpened`] for strips that wind around the axis,
 /// and what the method itself refuses.
 pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result<(Chart, Summary), Error> {
+    flatten_with_handles(strip, axis, &[], settings)
+}
+
+/// As [`flatten`], with the handles of the file that the settings of the method name ([`Method::handles_file`]).
+///
+/// # Errors
+/// As [`flatten`]; [`Error::HandlesNotRead`] when a file is named and no handles are given, [`Error::Handles`] for handles
+/// that do not fit the strip.
+pub fn flatten_with_handles(
+    strip: Strip,
+    axis: Option<&Axis>,
+    handles: &[Handle],
+    settings: &Settings,
+) -> Result<(Chart, Summary), Error> {
+    if let (Some(path), true) = (settings.method.handles_file(), handles.is_empty()) {
+        return Err(Error::HandlesNotRead { path: path.clone() });
+    }
     if let Some(value) = settings.smoothing_m.filter(|s| !(*s >= 0.0 && s.is_finite())) {
         return Err(Error::Setting { key: "smoothing_m", value, must: "0 or more metres" });
     }
@@ -317,6 +352,7 @@ pub fn flatten(strip: Strip, axis: Option<&Axis>, settings: &Settings) -> Result
         _ => section::Settings::default(),
     };
     let guide = axis.map(|axis| Guide::of_strip(&strip, axis, &section_settings)).transpose()?;
+    let guide = guide.map(|guide| guide.with_handles(handles));
     let (mut uv, solve) = settings.method.solve(&strip, guide.as_ref())?;
     let placement = registration::place(&strip, guide.as_ref(), settings.method.freedom(), &mut uv)?;
     let chart = Chart::new(strip, uv)?;

@@ -47,8 +47,9 @@ impl Handles {
         self.rows.iter().flatten().copied()
     }
 
-    /// Where the handles are when the tunnel is opened by `t` (0 closed, 1 flat), in the order of [`Handles::vertices`].
-    pub fn opened(&self, guide: &Guide, straight: &[Vec3], t: f64) -> Vec<Vec3> {
+    /// Where the handles are when the tunnel is opened by `t` (0 closed, 1 flat), in the order of [`Handles::vertices`];
+    /// flat they lie at their place in the section chart plus the displacement, if one is given.
+    pub fn opened(&self, guide: &Guide, straight: &[Vec3], displacement: Option<&[Vec2]>, t: f64) -> Vec<Vec3> {
         let mut places = Vec::new();
         for row in &self.rows {
             let section: Vec<Vec2> =
@@ -57,7 +58,8 @@ impl Handles {
             let opened = open_section(&section, &girth, t);
             for (&v, p) in row.iter().zip(opened) {
                 let chainage = (1.0 - t) * straight[v as usize].x + t * guide.uv()[v as usize].x;
-                places.push(Vec3::new(chainage, p.x, p.y));
+                let d = displacement.map_or_else(Vec2::zeros, |d| d[v as usize]) * t;
+                places.push(Vec3::new(chainage + d.x, p.x + d.y, p.y));
             }
         }
         places
