@@ -18,7 +18,9 @@ pub mod mesh;
 pub mod cut;
 pub mod unwrap;
 pub mod map;
+pub mod linework;
 pub mod lift;
+pub mod planes;
 
 // Where scans come from and where products go.
 pub mod synthetic;

@@ -9,7 +9,7 @@ use crate::map::{self, PaletteEntry, Placement};
 use crate::mesh::{Mesh, anchor};
 use crate::numeric::Vec2;
 use crate::pipeline::Pipeline;
-use crate::unwrap::Chart;
+use crate::unwrap::{self, Chart};
 use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -73,7 +73,8 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         .and_then(|strip| Ok(Chart::new(strip, uv)?))
         .map_err(|error| Failure::new(Exit::BadInput, error.context("chart.ply is not the chart of a run")))?;
 
-    let (anchors, _) = anchor::anchor_points(chart.strip().mesh(), cloud.positions(), &pipeline.anchor);
+    let (mut anchors, _) = anchor::anchor_points(chart.strip().mesh(), cloud.positions(), &pipeline.anchor);
+    anchors.release(&unwrap::covered_points(&unwrap::ChartIndex::of(&chart), &anchors));
     let uv = anchors.in_chart(chart.strip().mesh(), chart.uv());
     let limit = pipeline.map.max_offset_m.unwrap_or_else(|| map::automatic_max_offset_m(anchors.offsets()));
     let lifted = lift::labels_of_points(&label_map, &uv, anchors.offsets(), limit).map_err(lift_failure)?;
@@ -176,6 +177,11 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
     }
     told.push('\n');
     Ok((found.map, told, found.classes))
+}
+
+/// The classes on a picture of the map of a run, for other subcommands.
+pub(super) fn label_map_of(run: PathBuf, labels: PathBuf) -> Result<(LabelMap, String, Vec<PaletteEntry>)> {
+    read_label_map(&Arguments { run, labels, out: PathBuf::new(), faces: None })
 }
 
 /// A grey TIFF holds the labels themselves; its greatest number stands for "no surface".

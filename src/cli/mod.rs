@@ -5,15 +5,21 @@
 
 mod compare_methods;
 mod console;
+mod drape;
 mod exit;
 mod explain;
+mod flatten;
 mod info;
 mod lift;
 mod measure;
 mod nights;
+mod planes;
 mod run;
+mod run_surface;
 mod unwrap;
 mod synth;
+mod trace;
+mod verify;
 
 pub use console::Console;
 pub use exit::{Exit, Failure, Result};
@@ -38,6 +44,16 @@ enum Command {
     Info(info::Arguments),
     /// Bring what was painted on the map back to the points of the scan.
     Lift(lift::Arguments),
+    /// Turn strokes painted on the map into polylines, on the map and in 3D.
+    Trace(trace::Arguments),
+    /// Put linework of the map on the wall, in 3D.
+    Drape(drape::Arguments),
+    /// Bring 3D linework onto the map.
+    Flatten(flatten::Arguments),
+    /// Fit planes to traces, with sets, stereonet and statistics; or draw given planes on the map.
+    Planes(planes::Arguments),
+    /// Measure the way to the map and back again, from the files of a run alone.
+    Verify(verify::Arguments),
     /// Flatten one mesh.
     Unwrap(unwrap::Arguments),
     /// Make a synthetic scan of a tunnel that is known in closed form.
@@ -58,6 +74,11 @@ impl Command {
             Command::Explain(arguments) => explain::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
             Command::Lift(arguments) => lift::run(arguments, console),
+            Command::Trace(arguments) => trace::run(arguments, console),
+            Command::Drape(arguments) => drape::run(arguments, console),
+            Command::Flatten(arguments) => flatten::run(arguments, console),
+            Command::Planes(arguments) => planes::run(arguments, console),
+            Command::Verify(arguments) => verify::run(arguments, console),
             Command::Unwrap(arguments) => unwrap::run(arguments, console),
             Command::Synth(arguments) => synth::run(arguments, console),
             Command::CompareMethods(arguments) => compare_methods::run(arguments, console),

@@ -20,11 +20,14 @@ mod mesh_formats;
 mod mesh_scan;
 pub mod picture;
 pub mod png;
+pub mod raster_pixels;
 mod pcd;
+mod placed_points;
 mod point_table;
 mod poses;
 mod quiet_panics;
 mod source_bytes;
+pub mod vector;
 pub mod world_file;
 mod text;
 mod write;
@@ -36,6 +39,7 @@ pub use guards::PointGuards;
 pub use inspect::{ScanInfo, StationInfo, inspect};
 pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
+pub use placed_points::{PlacedPoint, placed_points};
 pub use write::{PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
 
 #[cfg(test)]

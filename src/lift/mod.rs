@@ -2,12 +2,15 @@
 //!
 //! [`recognise`] turns an edited picture into a [`LabelMap`] (which class is painted where), [`labels_of_points`] and
 //! [`labels_of_faces`] carry it to the scan. Both use the chart coordinates of the same anchors that drew the map.
+//! [`strokes()`] turns thin strokes into polylines on the map.
 
 mod label_map;
 mod paint;
+mod strokes;
 
 pub use label_map::{FaceLabels, LabelMap, NO_SURFACE, PointLabels, labels_of_faces, labels_of_points};
 pub use paint::{Base, Edited, Recognised, recognise};
+pub use strokes::{StrokeSettings, StrokeSummary, strokes};
 
 /// Why a picture does not become labels.
 #[derive(Debug, thiserror::Error, PartialEq)]

@@ -93,6 +93,16 @@ impl Anchors {
         Some(SurfacePoint { face, barycentric: [1.0 - b1 - b2, b1, b2], offset: self.offsets[point] })
     }
 
+    /// Takes the anchors of these points away: they have no place any more.
+    pub fn release(&mut self, points: &[usize]) {
+        for &point in points {
+            self.faces[point] = NO_FACE;
+            self.weights[point] = [f64::NAN; 2];
+            self.offsets[point] = f64::NAN;
+            self.exact[point] = false;
+        }
+    }
+
     /// Whether the anchor comes back to the point exactly (not clamped at a border).
     pub fn is_exact(&self, point: usize) -> bool {
         self.exact[point]
@@ -172,6 +182,23 @@ impl<'a> Anchoring<'a> {
         let placed = anchors.faces.iter().filter(|&&f| f != NO_FACE).count();
         let summary = Summary { points: count, anchored, clamped: placed - anchored, unanchored: count - placed };
         (anchors, summary)
+    }
+
+    /// The anchor of one point and whether it is exact; `None` farther than `max_offset_m` from the surface.
+    pub fn place(&self, point: &Vec3, settings: &Settings) -> Option<(SurfacePoint, bool)> {
+        self.anchor_one(point, settings.max_offset_m.max(0.0), None)
+    }
+
+    /// The nearest place of the surface at offset 0, and its distance; `None` beyond `reach_m`.
+    pub fn foot(&self, point: &Vec3, reach_m: f64) -> Option<(SurfacePoint, f64)> {
+        let nearest = self.tree.nearest(self.mesh, point, reach_m, None)?;
+        let foot = SurfacePoint { face: nearest.face, barycentric: nearest.barycentric, offset: 0.0 };
+        Some((foot, nearest.squared_distance.sqrt()))
+    }
+
+    /// The surface.
+    pub fn mesh(&self) -> &'a Mesh {
+        self.mesh
     }
 
     /// The anchor of one point and whether it is exact; `None` beyond `reach`.

@@ -76,6 +76,12 @@ pub struct Limits {
     pub distortion_p95_percent: Levels,
     /// Most distance between a point and its way to the map and back, 99th percentile, pixels.
     pub roundtrip_p99_px: Levels,
+    /// Most distance between any point and its way to the map and back, metres.
+    pub roundtrip_max_m: Levels,
+    /// Most distance on the map between a pixel and its way to the wall and back, pixels.
+    pub roundtrip_pixels_px: Levels,
+    /// Most distance in space between a line and its way to the map and back, metres.
+    pub roundtrip_lines_m: Levels,
     /// Most points of the input without a record in the output.
     pub lost_points: Levels,
     /// Most surface that no point supports, percent.
@@ -91,6 +97,9 @@ impl Default for Limits {
             coverage_percent: Levels::at(95.0, 90.0),
             distortion_p95_percent: Levels::at(10.0, 15.0),
             roundtrip_p99_px: Levels::at(0.1, 1.0),
+            roundtrip_max_m: Levels::fail_at(1e-6),
+            roundtrip_pixels_px: Levels::fail_at(0.01),
+            roundtrip_lines_m: Levels::fail_at(0.001),
             lost_points: Levels::fail_at(0.0),
             filled_percent: Levels { warn: Some(10.0), fail: None },
             duration_s: Levels::default(),

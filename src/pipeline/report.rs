@@ -102,9 +102,11 @@ fn compose(pipeline: &Pipeline, line: &Line, input_hashes: &[String]) -> Value {
         seconds += record.seconds;
         peak = peak.max(record.peak_memory_bytes);
         products.extend(record.files);
-        // The round trip is told by the anchors, but it is a property of the whole run.
-        if let Some(roundtrip) = section.remove("roundtrip") {
-            report.insert("roundtrip".into(), roundtrip);
+        // The round trip is told by the anchors (points) and the map (pixels and lines), but it is a property of the
+        // whole run.
+        if let Some(Value::Object(trip)) = section.remove("roundtrip") {
+            let whole = report.entry("roundtrip").or_insert_with(|| Value::Object(Map::new()));
+            whole.as_object_mut().expect("made here").extend(trip);
         }
         report.insert(stage.name.to_owned(), Value::Object(section));
     }
@@ -112,6 +114,14 @@ fn compose(pipeline: &Pipeline, line: &Line, input_hashes: &[String]) -> Value {
     report.insert("peak_memory_bytes".into(), json!(peak));
     report.insert("products".into(), json!(products));
     report.insert("pipeline".into(), serde_json::to_value(pipeline).expect("settings are plain data"));
+    let cell_m = report.get("map").and_then(|m| m["cell_m"].as_f64());
+    if let (Some(cell_m), Some(Value::Object(trip))) = (cell_m, report.get_mut("roundtrip")) {
+        for (metres, pixels) in [("max_m", "max_px"), ("p99_m", "p99_px")] {
+            if let Some(value) = trip.get(metres).and_then(Value::as_f64) {
+                trip.insert(pixels.into(), json!(value / cell_m));
+            }
+        }
+    }
     report["warnings"] = Value::Array(warnings);
     let checks = checks(&pipeline.limits, &Value::Object(report.clone()));
     report["status"] = json!(verdict(&checks));
@@ -166,6 +176,32 @@ pub fn checks(limits: &Limits, report: &Value) -> Vec<Check> {
             Sense::AtMost,
             limits.roundtrip_p99_px,
             roundtrip_px,
+        ),
+        Check::of(
+            "roundtrip_max_m",
+            "way to the map and back, every point",
+            "m",
+            Sense::AtMost,
+            limits.roundtrip_max_m,
+            at("/roundtrip/max_m").map(|m| if at("/roundtrip/lost") > Some(0.0) { f64::INFINITY } else { m }),
+        ),
+        Check::of(
+            "roundtrip_pixels_px",
+            "pixels to the wall and back",
+            "px",
+            Sense::AtMost,
+            limits.roundtrip_pixels_px,
+            at("/roundtrip/pixels/max_px")
+                .map(|px| if at("/roundtrip/pixels/lost") > Some(0.0) { f64::INFINITY } else { px }),
+        ),
+        Check::of(
+            "roundtrip_lines_m",
+            "lines to the wall and back",
+            "m",
+            Sense::AtMost,
+            limits.roundtrip_lines_m,
+            at("/roundtrip/lines/max_m")
+                .map(|m| if at("/roundtrip/lines/lost") > Some(0.0) { f64::INFINITY } else { m }),
         ),
         Check::of("lost_points", "points without a record in the output", "", Sense::AtMost, limits.lost_points, lost),
         Check::of(

@@ -11,11 +11,13 @@ use super::settings::Pipeline;
 use crate::axis::{self, Axis, AxisCoordinates};
 use crate::cloud::ScanFrame;
 use crate::io::ply::{PlyMesh, write_mesh};
+use crate::linework::{self, FlattenSettings};
 use crate::mesh::anchor;
 use crate::mesh::{self, FaceId, Mesh};
 use crate::numeric::{Vec2, Vec3};
 use crate::segment::{self, SectionField};
 use crate::unwrap::{self, Chart};
+use crate::warning::Warning;
 use crate::{clean, cut, io, map};
 use rayon::prelude::*;
 use serde_json::json;
@@ -32,7 +34,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "mesh", version: 1, needs: &["segment", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
-    Stage { name: "anchor", version: 1, needs: &["unwrap", "ingest"] },
+    Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 2, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
 ];
@@ -229,10 +231,14 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
     let placed = line.product("anchor", |_| {
         let (cloud, chart) = (cloud.get()?, chart.get()?);
         let mesh = chart.strip().mesh();
-        let (anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
-        let roundtrip = unwrap::round_trip(&chart, &anchors, cloud.positions());
+        let (mut anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
+        let index = unwrap::ChartIndex::of(&chart);
+        let covered = unwrap::covered_points(&index, &anchors);
+        anchors.release(&covered);
         let mut summary = section(&summary);
-        summary["roundtrip"] = json!(roundtrip);
+        summary["covered"] = json!(covered.len());
+        summary["warnings"] = json!(covered_warning(covered.len()));
+        summary["roundtrip"] = json!(unwrap::round_trip(&index, &anchors, cloud.positions()));
         Ok((PlacedPoints { uv: anchors.in_chart(mesh, chart.uv()), offsets_m: anchors.offsets().to_vec() }, summary))
     });
     let map = line.passing("map", |staging| {
@@ -350,7 +356,12 @@ fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Resu
         .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))?;
     let faces = unwrap::distortion::of_faces(input.chart.strip().mesh(), input.chart.uv());
     write_text("map", &folder.join("distortion_histogram.svg"), &map::distortion_histogram(&faces))?;
-    Ok(((), section(&summary)))
+    let index = unwrap::ChartIndex::of(input.chart);
+    let anchoring = anchor::Anchoring::of(input.chart.strip().mesh());
+    let settings = FlattenSettings { anchor: pipeline.anchor.clone(), ..FlattenSettings::default() };
+    let mut told = section(&summary);
+    told["roundtrip"] = json!(linework::certify(&index, &anchoring, summary.cell_m, &settings));
+    Ok(((), told))
 }
 
 /// Whether the input is a mesh. Several files, one of them a mesh, make no sense together.
@@ -420,6 +431,14 @@ impl Checkpoint for Chart {
         let strip = cut::Strip::load(columns)?;
         Chart::new(strip, Checkpoint::load(columns)?).map_err(|e| columns.damaged(e))
     }
+}
+
+/// What a person should know about points below another sheet of the map.
+fn covered_warning(covered: usize) -> Vec<Warning> {
+    let message = format!(
+        "{covered} points lie where the border of the map folds over another part of it: they have no place on the map"
+    );
+    if covered == 0 { Vec::new() } else { vec![Warning::new("covered_points", message)] }
 }
 
 /// Hashes of the input files; a file that cannot be read is bad input, told by its name.

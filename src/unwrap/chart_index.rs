@@ -2,12 +2,13 @@
 //!
 //! A grid over the chart lists the faces of each cell; the orientation of a place to the three sides of a candidate is
 //! computed in a form that has the same sign from both faces of an edge, so no place between two faces is lost.
-//! Where the chart covers itself, the face with the lowest number answers.
+//! Where the chart covers itself (its border crosses itself beside a notch or a hole), the face with the lowest number
+//! answers; what is anchored to the sheet below has no place on the map that leads back to it ([`covered_points`]).
 //! Cost: linear to build, constant a query.
 
 use super::Chart;
-use crate::mesh::SurfacePoint;
 use crate::mesh::anchor::Anchors;
+use crate::mesh::{FaceId, SurfacePoint};
 use crate::numeric::{Vec2, Vec3, statistics};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -76,6 +77,44 @@ impl<'a> ChartIndex<'a> {
         }
     }
 
+    /// The chart that is searched.
+    pub fn chart(&self) -> &'a Chart {
+        self.chart
+    }
+
+    /// All faces in the cells that the segment from `a` to `b` may touch, each once, by number.
+    pub fn faces_along(&self, a: Vec2, b: Vec2) -> Vec<FaceId> {
+        let mut faces = Vec::new();
+        let (from, to) = ((a - self.lowest) / self.cell, (b - self.lowest) / self.cell);
+        let (from, to) = if from.x <= to.x { (from, to) } else { (to, from) };
+        let last = self.columns as f64 - 1.0;
+        let (first_column, last_column) = ((from.x - 1e-6).floor().max(0.0), (to.x + 1e-6).floor().min(last));
+        let mut column = first_column;
+        while column <= last_column {
+            // Rows that the segment passes while it is in the column, one cell of rounding wider.
+            let at = |x: f64| match to.x - from.x {
+                width if width > 0.0 => from.y + (to.y - from.y) * ((x - from.x) / width).clamp(0.0, 1.0),
+                _ => from.y,
+            };
+            let (mut low, mut high) = (at(column - 1e-6), at(column + 1.0 + 1e-6));
+            if to.x - from.x <= 1.0 {
+                (low, high) = (from.y, to.y);
+            }
+            let rows =
+                ((low.min(high) - 1e-6).floor().max(0.0), (low.max(high) + 1e-6).floor().min(self.rows as f64 - 1.0));
+            let mut row = rows.0;
+            while row <= rows.1 {
+                let cell = row as usize * self.columns + column as usize;
+                faces.extend_from_slice(&self.faces[self.start[cell] as usize..self.start[cell + 1] as usize]);
+                row += 1.0;
+            }
+            column += 1.0;
+        }
+        faces.sort_unstable();
+        faces.dedup();
+        faces
+    }
+
     /// The surface under a place on the map, at offset 0; `None` beside the map and in its holes.
     pub fn surface_point(&self, place: Vec2) -> Option<SurfacePoint> {
         let at = (place - self.lowest) / self.cell;
@@ -116,6 +155,32 @@ fn barycentric([a, b, c]: [Vec2; 3], p: Vec2) -> Option<[f64; 3]> {
     Some([wa, wb, 1.0 - wa - wb])
 }
 
+/// A point whose place on the map leads to a surface point farther than this from its own, metres, lies on a covered
+/// sheet. Rounding between neighbouring faces stays far below.
+const COVERED_M: f64 = 1e-7;
+
+/// The points that the map cannot tell apart from others: their place is covered by another sheet of the chart, which
+/// happens where the border of the chart crosses itself. The map shows one sheet; the points of the other have no place.
+pub fn covered_points(index: &ChartIndex, anchors: &Anchors) -> Vec<usize> {
+    let mesh = index.chart.strip().mesh();
+    let normals = mesh.vertex_normals();
+    (0..anchors.len())
+        .into_par_iter()
+        .filter(|&i| {
+            let Some(anchor) = anchors.get(i) else { return false };
+            match index.surface_point(anchor.in_chart(mesh, index.chart.uv())) {
+                Some(foot) if foot.face == anchor.face => false,
+                Some(foot) => {
+                    let back = SurfacePoint { offset: anchor.offset, ..foot }.position(mesh, &normals);
+                    !((back - anchor.position(mesh, &normals)).norm() <= COVERED_M)
+                }
+                // A flipped or collapsed face: nothing of it is on the map.
+                None => true,
+            }
+        })
+        .collect()
+}
+
 /// What came of sending every anchored point to the map and back.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RoundTrip {
@@ -131,10 +196,10 @@ pub struct RoundTrip {
 
 /// Sends every exactly anchored point to (u, v, offset), finds the surface under (u, v) anew, and measures how far the
 /// point that comes back is from the one that was sent. Nothing of the anchor but (u, v, offset) is used on the way back.
-pub fn round_trip(chart: &Chart, anchors: &Anchors, points: &[Vec3]) -> RoundTrip {
+pub fn round_trip(index: &ChartIndex, anchors: &Anchors, points: &[Vec3]) -> RoundTrip {
+    let chart = index.chart;
     let mesh = chart.strip().mesh();
     let normals = mesh.vertex_normals();
-    let index = ChartIndex::of(chart);
     let errors: Vec<f64> = (0..points.len())
         .into_par_iter()
         .filter(|&i| anchors.is_exact(i))
@@ -175,7 +240,7 @@ mod tests {
             .collect();
         let (anchors, summary) = anchor_points(mesh, &points, &Settings::default());
         assert!(summary.clamped * 50 < summary.points && summary.unanchored == 0, "{summary:?}");
-        let trip = round_trip(&chart, &anchors, &points);
+        let trip = round_trip(&ChartIndex::of(&chart), &anchors, &points);
         assert_eq!((trip.points, trip.lost), (summary.anchored, 0));
         assert!(trip.max_m < 1e-9 && trip.p99_m <= trip.max_m, "{trip:?}");
     }
@@ -190,8 +255,29 @@ mod tests {
         // All of the map folded onto one line of faces: the way back cannot tell them apart.
         let folded: Vec<Vec2> = known.flat.iter().map(|p| Vec2::new((p.x - 6.0).abs(), p.y)).collect();
         let chart = Chart::new(known.strip, folded).unwrap();
-        let trip = round_trip(&chart, &anchors, &points);
+        let trip = round_trip(&ChartIndex::of(&chart), &anchors, &points);
         assert!(trip.max_m > 1.0 || trip.lost > 0, "{trip:?}");
+    }
+
+    #[test]
+    fn points_of_a_covered_sheet_are_found_and_all_others_come_back() {
+        let known = closed_form::prism();
+        let mesh = known.strip.mesh().clone();
+        let points: Vec<Vec3> =
+            (0..mesh.faces().len() as u32).map(|f| mesh.corners(f).iter().sum::<Vec3>() / 3.0).collect();
+        let (mut anchors, _) = anchor_points(&mesh, &points, &Settings::default());
+        // The last part of the map slides back over the part before it: flipped faces and two sheets in that range.
+        let slid: Vec<Vec2> = known.flat.iter().map(|p| Vec2::new(p.x - 0.6 * f64::from(p.x > 6.1), p.y)).collect();
+        let chart = Chart::new(known.strip, slid).unwrap();
+        let index = ChartIndex::of(&chart);
+        let before = round_trip(&index, &anchors, &points);
+        let covered = covered_points(&index, &anchors);
+        assert!(before.max_m > 0.1 || before.lost > 0, "{before:?}");
+        assert!(!covered.is_empty() && covered.len() * 2 < points.len(), "{}", covered.len());
+        anchors.release(&covered);
+        let after = round_trip(&index, &anchors, &points);
+        assert_eq!((after.points, after.lost), (points.len() - covered.len(), 0));
+        assert!(after.max_m < 1e-9, "{after:?}");
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub(crate) mod closed_form;
 #[cfg(test)]
 mod contract;
 
-pub use chart_index::{ChartIndex, RoundTrip, round_trip};
+pub use chart_index::{ChartIndex, RoundTrip, covered_points, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
 pub use handles::Handle;

@@ -9,10 +9,12 @@
 
 mod header;
 mod mesh;
+mod placed_points;
 mod read;
 mod rewrite;
 
 pub(super) use mesh::read_mesh;
 pub use mesh::{PlyMesh, RawMesh, read_chart, write_mesh};
+pub(super) use placed_points::placed_points;
 pub(super) use read::{describe, read};
 pub(super) use rewrite::{rewrite, write_new};
