@@ -20,7 +20,8 @@ Examples:
   adit lift runs/drift --labels edited.jpg --out lifted.laz --faces face_labels.csv
 
 Paint on map/labels.png, color.png, intensity.png or relief.png of the run with full, opaque colours: those of
-map/labels.json, or new ones, which become new classes. A resized picture is fine; a cropped one needs its world file.";
+map/labels.json, or new ones, which become new classes. Resized pictures, palettes and JPEG are fine; a cropped picture
+needs its world file. What is transparent on the wall was erased.";
 
 /// Arguments of `adit lift`.
 #[derive(clap::Args)]
@@ -35,6 +36,9 @@ pub struct Arguments {
     /// Where the points go (.laz, .las or .ply): all records as they were, plus label, chainage, girth and offset.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Also write what was recognised as a picture like map/labels.png, with a world file, to be checked by eye.
+    #[arg(long, value_name = "FILE.png")]
+    recognised: Option<PathBuf>,
     /// Also write the label of each face of chart.ply as CSV.
     #[arg(long, value_name = "FILE")]
     faces: Option<PathBuf>,
@@ -45,6 +49,12 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let pipeline = Pipeline::load(&need(&arguments.run, "pipeline.toml")?, &[])
         .map_err(|error| Failure::new(Exit::Usage, error))?;
     let (label_map, mut told, classes) = read_label_map(&arguments)?;
+    if let Some(path) = &arguments.recognised {
+        let picture = picture_of(&label_map, &classes);
+        io::write_picture(path, &picture, Some(label_map.placement.step_u))
+            .map_err(|e| Failure::new(Exit::Resources, e))?;
+        world_file::write(path, &label_map.placement).map_err(|e| Failure::new(Exit::Resources, e))?;
+    }
 
     let (raw, _) = io::ply::read_chart(&need(&arguments.run, "chart.ply")?).map_err(io_failure)?;
     let points = ["points.laz", "points.ply"].map(|name| arguments.run.join(name)).into_iter().find(|p| p.is_file());
@@ -168,6 +178,9 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
         found.painted_px,
         found.smoothed_px
     );
+    if found.erased_px > 0 {
+        let _ = write!(told, "; {} erased ones are unlabelled now", found.erased_px);
+    }
     if found.ambiguous_px > 0 {
         let _ = write!(told, "; {} between the classes were left as they were", found.ambiguous_px);
     }
@@ -181,7 +194,7 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
 
 /// The classes on a picture of the map of a run, for other subcommands.
 pub(super) fn label_map_of(run: PathBuf, labels: PathBuf) -> Result<(LabelMap, String, Vec<PaletteEntry>)> {
-    read_label_map(&Arguments { run, labels, out: PathBuf::new(), faces: None })
+    read_label_map(&Arguments { run, labels, out: PathBuf::new(), faces: None, recognised: None })
 }
 
 /// A grey TIFF holds the labels themselves; its greatest number stands for "no surface".
@@ -206,6 +219,20 @@ fn values_map(
     let classes = map::palette(labels.iter().copied().filter(|&l| l != NO_SURFACE));
     let told = format!("{} holds labels as numbers\n", path.display());
     Ok((LabelMap { width, height, placement, labels }, told, classes))
+}
+
+/// The classes in their colours, transparent where there is no surface.
+fn picture_of(label_map: &LabelMap, classes: &[PaletteEntry]) -> map::Picture {
+    let color = |label: &u32| match classes.iter().find(|c| c.value == *label) {
+        _ if *label == NO_SURFACE => [0; 4],
+        Some(PaletteEntry { color: [r, g, b], .. }) => [*r, *g, *b, 255],
+        None => {
+            let [r, g, b] = map::label_color(*label);
+            [r, g, b, 255]
+        }
+    };
+    let rgba = label_map.labels.iter().flat_map(color).collect();
+    map::Picture { width: label_map.width, height: label_map.height, rgba }
 }
 
 fn need(run: &Path, name: &str) -> Result<PathBuf> {

@@ -13,9 +13,11 @@ mod info;
 mod lift;
 mod measure;
 mod nights;
+mod package;
 mod planes;
 mod run;
 mod run_surface;
+mod sheet;
 mod unwrap;
 mod synth;
 mod trace;
@@ -62,6 +64,10 @@ enum Command {
     CompareMethods(compare_methods::Arguments),
     /// Measure on the map and on the surface under it.
     Measure(measure::Arguments),
+    /// Print the map at true scale: PDF, SVG or PNG.
+    Sheet(sheet::Arguments),
+    /// Pack everything that is needed to use the map without Adit.
+    Package(package::Arguments),
 }
 
 impl Command {
@@ -83,6 +89,8 @@ impl Command {
             Command::Synth(arguments) => synth::run(arguments, console),
             Command::CompareMethods(arguments) => compare_methods::run(arguments, console),
             Command::Measure(arguments) => measure::run(arguments, console),
+            Command::Sheet(arguments) => sheet::run(arguments, console),
+            Command::Package(arguments) => package::run(arguments, console),
         }
     }
 }

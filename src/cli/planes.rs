@@ -282,7 +282,7 @@ fn write_products(
         std::fs::write(&path, text).map_err(|e| cannot_write(&path, e))?;
     }
     let path = folder.join("stereonet.png");
-    crate::io::write_picture(&path, &net.picture(2.0)).map_err(|e| Failure::new(Exit::Resources, e))?;
+    crate::io::write_picture(&path, &net.picture(2.0), None).map_err(|e| Failure::new(Exit::Resources, e))?;
     Ok(())
 }
 

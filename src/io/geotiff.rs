@@ -14,7 +14,8 @@
 //! Departures: floats have no predictor (predictor 3 is missing in light readers); integers use predictor 2. There is no
 //! EPSG code for a tunnel map, so the keys say "user-defined, metres" and name it in the citation.
 //!
-//! Cost: one compression of each tile (Deflate), a third more for the overviews; memory of a few rows of tiles.
+//! Cost: one compression of each tile (Deflate), a third more for the overviews; memory of a few rows of tiles of each
+//! resolution, because overviews wait in a file, too.
 
 use crate::map::{Grid, LayerDescription, NoData, Resampling, SampleType};
 use flate2::{Compression, write::ZlibEncoder};
@@ -26,6 +27,8 @@ use std::path::{Path, PathBuf};
 
 /// Deflate level: a third of the time of the usual 6 for files some percent larger.
 const DEFLATE_LEVEL: u32 = 3;
+/// Most of a float is noise to Deflate: trying harder only takes longer.
+const FLOAT_LEVEL: u32 = 1;
 /// Overviews are added until one fits into this many pixels.
 const SMALLEST_OVERVIEW_PX: usize = 512;
 /// Classic TIFF holds 32-bit offsets; beyond this many bytes of tiles BigTIFF is written.
@@ -40,6 +43,10 @@ pub struct GeoTiffWriter {
     spool_path: PathBuf,
     spool: BufWriter<File>,
     spool_length: u64,
+    /// The tiles of all overviews.
+    overviews_path: PathBuf,
+    overviews: BufWriter<File>,
+    overviews_length: u64,
     grid: Grid,
     layer: LayerDescription,
     tile_px: usize,
@@ -53,10 +60,8 @@ struct Level {
     height: usize,
     across: usize,
     down: usize,
-    /// Where each tile is: offset in the spool (full resolution) or in `bytes` (overviews), and its length.
+    /// Where each tile is: its offset in the file in which it waits, and its length.
     tiles: Vec<(u64, u64)>,
-    /// Compressed tiles of an overview.
-    bytes: Vec<u8>,
     /// Overview tiles that still wait for some of their four parts.
     pending: BTreeMap<(usize, usize), (Vec<u8>, usize)>,
 }
@@ -83,12 +88,16 @@ impl GeoTiffWriter {
             levels.push(Level::new(last.width.div_ceil(2), last.height.div_ceil(2), tile_px));
         }
         let spool_path = with_suffix(path, ".tiles");
+        let overviews_path = with_suffix(path, ".overviews");
         Ok(Self {
             path: path.to_owned(),
             partial: with_suffix(path, ".partial"),
             spool: BufWriter::with_capacity(1 << 20, File::create(&spool_path)?),
             spool_path,
             spool_length: 0,
+            overviews: BufWriter::with_capacity(1 << 18, File::create(&overviews_path)?),
+            overviews_path,
+            overviews_length: 0,
             grid: *grid,
             layer: layer.clone(),
             tile_px,
@@ -108,8 +117,7 @@ impl GeoTiffWriter {
             self.spool.write_all(bytes)?;
             self.spool_length += bytes.len() as u64;
         }
-        self.add_to_overview(1, tiles);
-        Ok(())
+        self.add_to_overview(1, tiles)
     }
 
     /// Completes the file under its name.
@@ -122,22 +130,26 @@ impl GeoTiffWriter {
             return Err(io::Error::other(message));
         }
         self.spool.flush()?;
-        let overviews: u64 = self.levels.iter().map(|l| l.bytes.len() as u64).sum();
+        self.overviews.flush()?;
         let tile_count: usize = self.levels.iter().map(|l| l.tiles.len()).sum();
-        let big = self.spool_length + overviews + 16 * tile_count as u64 > CLASSIC_LIMIT;
+        let big = self.spool_length + self.overviews_length + 16 * tile_count as u64 > CLASSIC_LIMIT;
         // Twice: the first pass tells how long the directories are.
         let head_length = self.head(big, 0).len() as u64;
         let head = self.head(big, head_length);
         let mut out = BufWriter::with_capacity(1 << 20, File::create(&self.partial)?);
         out.write_all(&head)?;
-        for level in self.levels[1..].iter().rev() {
-            out.write_all(&level.bytes)?;
+        let mut waiting = File::open(&self.overviews_path)?;
+        let mut block = Vec::new();
+        for &(offset, length) in self.levels[1..].iter().rev().flat_map(|level| &level.tiles) {
+            waiting.seek(SeekFrom::Start(offset))?;
+            block.resize(length as usize, 0);
+            waiting.read_exact(&mut block)?;
+            out.write_all(&block)?;
         }
         let mut tiles = BufReader::with_capacity(1 << 20, File::open(&self.spool_path)?);
         if self.levels[0].in_order() {
             io::copy(&mut tiles, &mut out)?;
         } else {
-            let mut block = Vec::new();
             for &(offset, length) in &self.levels[0].tiles {
                 tiles.seek(SeekFrom::Start(offset))?;
                 block.resize(length as usize, 0);
@@ -147,6 +159,7 @@ impl GeoTiffWriter {
         }
         out.into_inner().map_err(|e| e.into_error())?.sync_all()?;
         fs::remove_file(&self.spool_path)?;
+        fs::remove_file(&self.overviews_path)?;
         fs::rename(&self.partial, &self.path)
     }
 
@@ -156,7 +169,8 @@ impl GeoTiffWriter {
 
     fn compress(&self, raw: &[u8]) -> Vec<u8> {
         let size = sample_bytes(self.layer.sample);
-        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::new(DEFLATE_LEVEL));
+        let level = if has_predictor(self.layer.sample) { DEFLATE_LEVEL } else { FLOAT_LEVEL };
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::new(level));
         let result = if has_predictor(self.layer.sample) {
             encoder.write_all(&difference(raw, self.tile_px, self.layer.bands.len(), size))
         } else {
@@ -166,9 +180,9 @@ impl GeoTiffWriter {
     }
 
     /// Halves the tiles into the overview `level`; complete overview tiles are compressed and passed on.
-    fn add_to_overview(&mut self, level: usize, tiles: Vec<RawTile>) {
+    fn add_to_overview(&mut self, level: usize, tiles: Vec<RawTile>) -> io::Result<()> {
         if level >= self.levels.len() || tiles.is_empty() {
-            return;
+            return Ok(());
         }
         let (tile_px, pixel) = (self.tile_px, self.bytes_per_pixel());
         let halves: Vec<Vec<u8>> = tiles.par_iter().map(|t| self.halve(&t.bytes)).collect();
@@ -200,10 +214,11 @@ impl GeoTiffWriter {
         let compressed: Vec<Vec<u8>> = ready.par_iter().map(|t| self.compress(&t.bytes)).collect();
         let target = &mut self.levels[level];
         for (tile, bytes) in ready.iter().zip(compressed) {
-            target.tiles[tile.row * target.across + tile.column] = (target.bytes.len() as u64, bytes.len() as u64);
-            target.bytes.extend_from_slice(&bytes);
+            target.tiles[tile.row * target.across + tile.column] = (self.overviews_length, bytes.len() as u64);
+            self.overviews.write_all(&bytes)?;
+            self.overviews_length += bytes.len() as u64;
         }
-        self.add_to_overview(level + 1, ready);
+        self.add_to_overview(level + 1, ready)
     }
 
     /// A tile at half the resolution: `tile_px / 2` squared.
@@ -259,7 +274,7 @@ impl GeoTiffWriter {
         let mut next = tiles_start;
         for k in (1..self.levels.len()).rev() {
             starts[k] = next;
-            next += self.levels[k].bytes.len() as u64;
+            next += self.levels[k].tiles.iter().map(|t| t.1).sum::<u64>();
         }
         starts[0] = next;
         let mut out = Vec::new();
@@ -360,6 +375,7 @@ impl Drop for GeoTiffWriter {
     fn drop(&mut self) {
         // Only there when writing was broken off.
         fs::remove_file(&self.spool_path).ok();
+        fs::remove_file(&self.overviews_path).ok();
         fs::remove_file(&self.partial).ok();
     }
 }
@@ -367,15 +383,7 @@ impl Drop for GeoTiffWriter {
 impl Level {
     fn new(width: usize, height: usize, tile_px: usize) -> Self {
         let (across, down) = (width.div_ceil(tile_px), height.div_ceil(tile_px));
-        Self {
-            width,
-            height,
-            across,
-            down,
-            tiles: vec![(0, 0); across * down],
-            bytes: Vec::new(),
-            pending: BTreeMap::new(),
-        }
+        Self { width, height, across, down, tiles: vec![(0, 0); across * down], pending: BTreeMap::new() }
     }
 
     fn in_order(&self) -> bool {
@@ -387,21 +395,14 @@ impl Level {
         })
     }
 
-    /// File offsets of the tiles, given where the level starts. The full resolution is written in tile order,
-    /// overviews in the order in which they were completed.
+    /// File offsets of the tiles, which lie one after the other in their order, given where the level starts.
     fn offsets(&self, start: u64) -> Vec<u64> {
-        if self.bytes.is_empty() {
-            let mut next = start;
-            return self
-                .tiles
-                .iter()
-                .map(|t| {
-                    next += t.1;
-                    next - t.1
-                })
-                .collect();
-        }
-        self.tiles.iter().map(|t| start + t.0).collect()
+        let mut next = start;
+        let mut place = |t: &(u64, u64)| {
+            next += t.1;
+            next - t.1
+        };
+        self.tiles.iter().map(&mut place).collect()
     }
 }
 

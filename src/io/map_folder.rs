@@ -2,8 +2,11 @@
 
 use super::geotiff::{GeoTiffWriter, RawTile, no_data_tile, sample_bytes};
 use super::png::PngWriter;
+use super::tile_pyramid::{self, TilePyramid};
 use super::world_file;
-use crate::map::{Grid, LayerDescription, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX};
+use crate::map::{
+    Grid, LayerDescription, Legend, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX,
+};
 use crate::numeric::Vec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -11,9 +14,13 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Pictures are reduced to at most this many columns and pixels: few programs open more. GeoTIFFs have no such limit.
+/// Pictures are reduced to at most this many columns and pixels: few programs open more. GeoTIFFs and web tiles have no
+/// such limit.
 const PICTURE_MAX_WIDTH: usize = 65_000;
 const PICTURE_MAX_PIXELS: usize = 1_000_000_000;
+
+/// Folder of the web tiles.
+const TILES: &str = "tiles";
 
 /// Writes the layers of a map into a folder; see [`crate::map::draw`].
 pub struct MapFolder {
@@ -22,6 +29,7 @@ pub struct MapFolder {
     layers: Vec<LayerFiles>,
     /// Every how many pixels make one of the pictures.
     reduction: usize,
+    tiles: bool,
 }
 
 /// The files of one layer while they are written.
@@ -29,6 +37,7 @@ struct LayerFiles {
     description: LayerDescription,
     raster: Option<GeoTiffWriter>,
     picture: Option<PictureRows>,
+    tiles: Option<TilePyramid>,
 }
 
 /// Rows of the picture that are not complete yet.
@@ -92,7 +101,13 @@ impl LabelsFile {
 impl MapFolder {
     /// A sink that writes into `folder`, which must exist.
     pub fn new(folder: &Path) -> Self {
-        Self { folder: folder.to_owned(), grid: None, layers: Vec::new(), reduction: 1 }
+        Self { folder: folder.to_owned(), grid: None, layers: Vec::new(), reduction: 1, tiles: false }
+    }
+
+    /// Whether a web tile pyramid with its viewer goes into the folder `tiles`, too.
+    pub fn with_tiles(mut self, tiles: bool) -> Self {
+        self.tiles = tiles;
+        self
     }
 
     /// Every how many pixels of the map make one pixel of the pictures; 1 except for enormous maps.
@@ -104,6 +119,12 @@ impl MapFolder {
         self.grid = Some(*grid);
         self.reduction = picture_reduction(grid.width(), grid.height());
         let (width, height) = (grid.width().div_ceil(self.reduction), grid.height().div_ceil(self.reduction));
+        let legend = Legend::of(grid, layers);
+        let path = self.folder.join("legend.json");
+        let mut text = serde_json::to_string_pretty(&legend)
+            .map_err(|e| Error::Io { path: path.clone(), source: io::Error::other(e) })?;
+        text.push('\n');
+        fs::write(&path, text).map_err(|source| Error::Io { path: path.clone(), source })?;
         let placement = Placement::of_grid(grid);
         let picture_placement = picture_placement(grid, self.reduction);
         for description in layers {
@@ -113,7 +134,9 @@ impl MapFolder {
             let raster = GeoTiffWriter::create(&path, grid, description, TILE_PX).map_err(failed)?;
             world_file::write(&path, &placement)?;
             let mut picture = None;
-            if description.look != Look::None {
+            let shown = description.look != Look::None;
+            let pyramid = (self.tiles && shown).then(|| TilePyramid::new(&self.folder.join(TILES), grid, description));
+            if shown {
                 let path = self.folder.join(format!("{name}.png"));
                 let failed = |source| Error::Io { path: path.clone(), source };
                 let cell_m = picture_placement.step_u;
@@ -137,7 +160,14 @@ impl MapFolder {
                 text.push('\n');
                 fs::write(&path, text).map_err(|source| Error::Io { path: path.clone(), source })?;
             }
-            self.layers.push(LayerFiles { description: description.clone(), raster: Some(raster), picture });
+            let raster = Some(raster);
+            self.layers.push(LayerFiles { description: description.clone(), raster, picture, tiles: pyramid });
+        }
+        if self.tiles {
+            let shown: Vec<&LayerDescription> = layers.iter().filter(|l| l.look != Look::None).collect();
+            let folder = self.folder.join(TILES);
+            tile_pyramid::write_viewer(&folder, grid, &shown)
+                .map_err(|source| Error::Io { path: folder.join("index.html"), source })?;
         }
         Ok(())
     }
@@ -164,6 +194,10 @@ impl MapFolder {
                     let path = folder.join(format!("{name}.png"));
                     let pixels = files.description.picture(&piece.layers[k]);
                     picture.take(&grid, piece, &pixels, reduction).map_err(|source| Error::Io { path, source })?;
+                    if let Some(tiles) = &mut files.tiles {
+                        let path = folder.join(TILES).join(name);
+                        tiles.take(piece, &pixels).map_err(|source| Error::Io { path, source })?;
+                    }
                 }
             }
             Ok(())
@@ -186,13 +220,13 @@ impl MapFolder {
     }
 }
 
-/// Writes a picture such as the overview.
+/// Writes a picture such as the overview; `pixel_m` is noted as the size of a pixel on paper.
 ///
 /// # Errors
 /// `Error::Io`.
-pub fn write_picture(path: &Path, picture: &Picture) -> Result<(), Error> {
+pub fn write_picture(path: &Path, picture: &Picture, pixel_m: Option<f64>) -> Result<(), Error> {
     let failed = |source| Error::Io { path: path.to_owned(), source };
-    let mut writer = PngWriter::create(path, picture.width, picture.height, None).map_err(failed)?;
+    let mut writer = PngWriter::create(path, picture.width, picture.height, pixel_m).map_err(failed)?;
     writer.write_rows(&picture.rgba).map_err(failed)?;
     writer.finish().map_err(failed)
 }
@@ -299,7 +333,13 @@ mod tests {
         let chart = flat_chart(13.0, 3.1, 30, 10);
         let section: Vec<f64> = chart.uv().iter().map(|p| 0.02 * (p.x - 6.5)).collect();
         let frame = ScanFrame::local();
-        let input = DrawInput { chart: &chart, points: None, frame: &frame, section_offsets_m: Some(&section) };
+        let input = DrawInput {
+            chart: &chart,
+            points: None,
+            frame: &frame,
+            section_offsets_m: Some(&section),
+            design_offsets_m: None,
+        };
         let settings = Settings { cell_m: Some(0.01), ..Default::default() };
         let mut sink = MapFolder::new(folder.path());
         let summary = draw(&input, &settings, &mut sink).unwrap();
@@ -315,7 +355,11 @@ mod tests {
         let mut names: Vec<String> =
             fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
-        assert_eq!(names.len(), 5 * 4 + 1, "{names:?}");
+        assert_eq!(names.len(), 5 * 4 + 2, "{names:?}");
+        let legend: Legend =
+            serde_json::from_str(&fs::read_to_string(folder.path().join("legend.json")).unwrap()).unwrap();
+        assert_eq!(legend.layers.iter().map(|l| l.layer).collect::<Vec<_>>(), summary.layers);
+        assert_eq!((legend.cell_m, legend.width_px, legend.height_px), (0.01, 1300, 310));
         assert!(world_file::read(&folder.path().join("offset.tif")).unwrap().is_some());
     }
 

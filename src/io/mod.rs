@@ -6,6 +6,7 @@
 mod assemble;
 mod crs;
 mod detect;
+pub mod drawing;
 mod e57;
 mod error;
 mod file_scan;
@@ -21,13 +22,17 @@ mod mesh_scan;
 pub mod picture;
 pub mod png;
 pub mod raster_pixels;
+mod package_file;
 mod pcd;
 mod placed_points;
 mod point_table;
 mod poses;
 mod quiet_panics;
+pub mod raster_file;
 mod source_bytes;
 pub mod vector;
+mod scan_date;
+mod tile_pyramid;
 pub mod world_file;
 mod text;
 mod write;
@@ -39,7 +44,9 @@ pub use guards::PointGuards;
 pub use inspect::{ScanInfo, StationInfo, inspect};
 pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
+pub use package_file::{PackageError, PackageFile};
 pub use placed_points::{PlacedPoint, placed_points};
+pub use scan_date::las_creation_date;
 pub use write::{PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
 
 #[cfg(test)]

@@ -42,6 +42,17 @@ pub enum Error {
         /// Share of equal pixels, percent.
         percent: f64,
     },
+    /// The picture is one of the map, but its colours were changed too much.
+    #[error(
+        "the picture is like '{closest}' of this map, but its colours differ by {difference:.0} of 255 throughout, as when a \
+         program reduces them to a few: save it with full colours, or with a palette made for it"
+    )]
+    Noisy {
+        /// The picture of the map that is most like it.
+        closest: String,
+        /// Median difference of the colours.
+        difference: f64,
+    },
     /// Too many painted pixels cannot be told.
     #[error(
         "{ambiguous} of {painted} painted pixels have colours between the classes, for example {color} at column \

@@ -1,7 +1,10 @@
 //! Colours for values: a diverging ramp for signed distances, a sequential one for stretch, distinct ones for labels.
 
+use serde::{Deserialize, Serialize};
+
 /// Colour ramps; every colour between two stops is interpolated linearly in sRGB.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Ramp {
     /// Blue - nearly white - red; the middle is zero.
     Diverging,

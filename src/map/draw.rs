@@ -7,7 +7,7 @@ use super::layer::{
 };
 use super::rasterize::{FaceIndex, NO_FACE, SurfaceTile};
 use super::sampling::{ScatterIndex, Spacing};
-use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, relief};
+use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, relief, roughness};
 use crate::cloud::{Cloud, ScanFrame};
 use crate::numeric::{Vec2, statistics};
 use crate::unwrap::{Chart, distortion};
@@ -21,6 +21,10 @@ const OFFSET_LIMIT: f64 = 5.0;
 const OFFSET_LIMIT_BOUNDS_M: (f64, f64) = (0.1, 0.3);
 /// Steps of the offset layer, metres: far below any scanner's noise, and it lets the file be compressed.
 const OFFSET_STEP_M: f64 = 1.0 / 8192.0;
+/// Steps of the roughness layer, metres.
+const ROUGHNESS_STEP_M: f64 = 1.0 / 131_072.0;
+/// Steps of the weights in the layer of surface points: under a nanometre on any face, and less to store.
+const WEIGHT_STEP: f64 = 1.0 / 1_073_741_824.0;
 /// Pixel size of charts without scan points, as a share of the mean edge length.
 const CELL_PER_EDGE: f64 = 0.25;
 
@@ -45,6 +49,8 @@ pub struct DrawInput<'a> {
     /// Signed distance of each vertex of the chart from the local mean section in metres, positive into the void.
     /// Needed by the layers offset and relief.
     pub section_offsets_m: Option<&'a [f64]>,
+    /// Signed distance of each vertex of the chart from the design profile in metres, positive inside it.
+    pub design_offsets_m: Option<&'a [f64]>,
 }
 
 /// A finished piece of the map: one column of samples for each layer, in the order of the descriptions.
@@ -122,6 +128,7 @@ struct Plan<'a> {
     faces: FaceIndex,
     scatter: Option<(Scatter<'a>, Reach)>,
     shade: Vec<f32>,
+    roughness: Vec<f32>,
     stretch: Vec<[f32; 4]>,
     layers: Vec<LayerDescription>,
     max_offset_m: f64,
@@ -138,6 +145,9 @@ impl<'a> Plan<'a> {
         let vertices = mesh.vertices().len();
         if let Some(found) = input.section_offsets_m.map(<[f64]>::len).filter(|&n| n != vertices) {
             return Err(Error::Length { column: "the distance from the mean section", found, expected: vertices });
+        }
+        if let Some(found) = input.design_offsets_m.map(<[f64]>::len).filter(|&n| n != vertices) {
+            return Err(Error::Length { column: "the distance from the design profile", found, expected: vertices });
         }
         if let Some((cloud, points)) = input.points {
             for (column, found) in [("the place on the map", points.uv.len()), ("the offset", points.offsets_m.len())] {
@@ -188,14 +198,30 @@ impl<'a> Plan<'a> {
             Some(offsets) if wanted.contains(&Layer::Relief) => relief::shade_vertices(input.chart, offsets),
             _ => Vec::new(),
         };
+        let roughness = match input.section_offsets_m {
+            Some(offsets) if wanted.contains(&Layer::Roughness) => {
+                let window_m = settings.roughness_window_m;
+                if !(window_m.is_finite() && window_m > 0.0) {
+                    return Err(Error::Window { window_m });
+                }
+                roughness::roughness(input.chart, offsets, window_m)
+            }
+            _ => Vec::new(),
+        };
+        let roughness_range_m = {
+            let mut values: Vec<f64> = roughness.iter().filter(|r| r.is_finite()).map(|&r| f64::from(r)).collect();
+            super::grid::next_in_series(statistics::quantile(&mut values, 0.98).unwrap_or(0.01).max(0.001))
+        };
         let stretch: Vec<[f32; 4]> = if wanted.contains(&Layer::Distortion) {
             (0..mesh.faces().len() as u32).into_par_iter().map(|f| stretch_of(input.chart, f)).collect()
         } else {
             Vec::new()
         };
         let stretch_range = stretch_range(&stretch);
-        let layers: Vec<LayerDescription> =
-            wanted.iter().map(|&layer| describe(layer, input, offset_range_m, stretch_range)).collect();
+        let layers: Vec<LayerDescription> = wanted
+            .iter()
+            .map(|&layer| describe(layer, input, offset_range_m, stretch_range, roughness_range_m))
+            .collect();
         let has = |layer| wanted.contains(&layer);
         let scatter = sampled.map(|(cloud, index, spacing)| {
             let reach = Reach::new(&spacing, settings.fill_m, cell_m);
@@ -209,6 +235,7 @@ impl<'a> Plan<'a> {
             faces,
             scatter,
             shade,
+            roughness,
             stretch,
             layers,
             max_offset_m,
@@ -292,8 +319,9 @@ impl<'a> Plan<'a> {
                     _ => Samples::U32((0..pixels).map(|i| if on_surface(i) { label(i) } else { u32::MAX }).collect()),
                 }
             }
-            Layer::Offset => {
-                let offsets = self.input.section_offsets_m;
+            Layer::Offset | Layer::DesignOffset => {
+                let offsets =
+                    if layer == Layer::Offset { self.input.section_offsets_m } else { self.input.design_offsets_m };
                 Samples::F32(
                     (0..pixels)
                         .map(|i| match offsets {
@@ -307,6 +335,19 @@ impl<'a> Plan<'a> {
                         .collect(),
                 )
             }
+            Layer::Roughness => Samples::F32(
+                (0..pixels)
+                    .map(|i| {
+                        if !on_surface(i) || self.roughness.is_empty() {
+                            return f32::NAN;
+                        }
+                        let w = surface.weights(i);
+                        let rough = |v: u32| f64::from(self.roughness[v as usize]);
+                        let value: f64 = corners(i).iter().zip(w).map(|(&v, w)| rough(v) * w).sum();
+                        ((value / ROUGHNESS_STEP_M).round() * ROUGHNESS_STEP_M) as f32
+                    })
+                    .collect(),
+            ),
             Layer::Coverage => Samples::U8(coverage.to_vec()),
             Layer::Distortion => {
                 let mut bands = vec![f32::NAN; pixels * 4];
@@ -349,7 +390,8 @@ impl<'a> Plan<'a> {
                 for (i, out) in bands.as_chunks_mut::<3>().0.iter_mut().enumerate() {
                     if on_surface(i) {
                         let [_, b, c] = surface.weights(i);
-                        *out = [f64::from(surface.faces[i]), b, c];
+                        let step = |w: f64| (w / WEIGHT_STEP).round() * WEIGHT_STEP;
+                        *out = [f64::from(surface.faces[i]), step(b), step(c)];
                     }
                 }
                 Samples::F64(bands)
@@ -451,10 +493,15 @@ fn wanted_layers(input: &DrawInput, settings: &Settings, has_points: bool, warni
     if let Some(message) = no_intensity {
         leave_out(Layer::Intensity, "no-intensity", message);
     }
+    if input.design_offsets_m.is_none() {
+        let message = "no map.design_profile is given, so map/design_offset is not drawn";
+        leave_out(Layer::DesignOffset, "no-design-profile", message);
+    }
     if input.section_offsets_m.is_none() {
         let message = "the mean section is not known, so map/offset and map/relief are not drawn";
         leave_out(Layer::Offset, "no-mean-section", message);
         leave_out(Layer::Relief, "no-mean-section", message);
+        leave_out(Layer::Roughness, "no-mean-section", "the mean section is not known, so map/roughness is not drawn");
     } else if no_color.is_some() && !wanted.contains(&Layer::Relief) {
         wanted.push(Layer::Relief);
     }
@@ -475,7 +522,13 @@ fn stretch_range(stretch: &[[f32; 4]]) -> f64 {
     1.0 + super::grid::next_in_series((q - 1.0).clamp(0.05, 1.0))
 }
 
-fn describe(layer: Layer, input: &DrawInput, offset_range_m: f64, stretch_range: f64) -> LayerDescription {
+fn describe(
+    layer: Layer,
+    input: &DrawInput,
+    offset_range_m: f64,
+    stretch_range: f64,
+    roughness_range_m: f64,
+) -> LayerDescription {
     let attributes = input.points.map(|(cloud, _)| cloud.attributes());
     let labels = attributes.and_then(|a| a.labels.as_deref()).unwrap_or_default();
     let of = |sample, bands: &[&'static str], no_data, resampling, look, unit, meaning| LayerDescription {
@@ -522,6 +575,16 @@ fn describe(layer: Layer, input: &DrawInput, offset_range_m: f64, stretch_range:
             let look = Look::Ramp { ramp: Ramp::Diverging, low: -offset_range_m, high: offset_range_m };
             let meaning = "distance of the surface from the local mean section, positive into the void";
             of(S::F32, &["offset"], N::Nan, R::Mean, look, "m", meaning)
+        }
+        Layer::DesignOffset => {
+            let look = Look::Ramp { ramp: Ramp::Diverging, low: -offset_range_m, high: offset_range_m };
+            let meaning = "distance of the surface from the design profile, positive where rock stands inside it";
+            of(S::F32, &["design_offset"], N::Nan, R::Mean, look, "m", meaning)
+        }
+        Layer::Roughness => {
+            let look = Look::Ramp { ramp: Ramp::Heat, low: 0.0, high: roughness_range_m };
+            let meaning = "rms of the height over the plane that fits best in a window of map.roughness_window_m";
+            of(S::F32, &["roughness"], N::Nan, R::Mean, look, "m", meaning)
         }
         Layer::Coverage => {
             let meaning = "0 no surface, 1 observed, 2 filled (interpolated)";
@@ -647,10 +710,11 @@ mod tests {
             points: Some((&cloud, PointsOnMap { uv: &uv, offsets_m: &offsets_m })),
             frame: &frame,
             section_offsets_m: Some(&section),
+            design_offsets_m: Some(&section),
         };
         let mut layers = Settings::default().layers;
-        layers.extend([Layer::Relief, Layer::Xyz, Layer::SurfacePoint]);
-        let settings = Settings { cell_m: Some(0.02), layers, ..Default::default() };
+        layers.extend([Layer::Relief, Layer::Xyz, Layer::SurfacePoint, Layer::DesignOffset, Layer::Roughness]);
+        let settings = Settings { cell_m: Some(0.02), layers, roughness_window_m: 1.6, ..Default::default() };
         let mut sink = InMemory::default();
         let summary = draw(&input, &settings, &mut sink).unwrap();
         assert_eq!((summary.width_px, summary.height_px), (600, 315));
@@ -672,6 +736,8 @@ mod tests {
             let (description, labels) = layer(Layer::Labels);
             assert_eq!((description.sample, labels[i]), (SampleType::U16, if uv.x > 6.0 { 300.0 } else { 0.0 }));
             assert!((layer(Layer::Offset).1[i] - 0.01 * uv.x).abs() < OFFSET_STEP_M);
+            assert!((layer(Layer::DesignOffset).1[i] - 0.01 * uv.x).abs() < OFFSET_STEP_M);
+            assert!(layer(Layer::Roughness).1[i] < 1e-5);
             assert_eq!(layer(Layer::Coverage).1[i], 1.0);
             let stretch = &layer(Layer::Distortion).1[4 * i..4 * i + 4];
             assert!((stretch[0] - 1.0).abs() < 0.01 && (stretch[1] - 1.0).abs() < 0.01);
@@ -688,7 +754,13 @@ mod tests {
     #[test]
     fn a_mesh_alone_gives_the_geometric_layers() {
         let chart = half_cylinder();
-        let input = DrawInput { chart: &chart, points: None, frame: &ScanFrame::local(), section_offsets_m: None };
+        let input = DrawInput {
+            chart: &chart,
+            points: None,
+            frame: &ScanFrame::local(),
+            section_offsets_m: None,
+            design_offsets_m: None,
+        };
         let mut sink = InMemory::default();
         let summary = draw(&input, &Settings::default(), &mut sink).unwrap();
         assert_eq!(summary.layers, [Layer::Labels, Layer::Coverage, Layer::Distortion]);
@@ -698,8 +770,13 @@ mod tests {
     #[test]
     fn columns_must_fit() {
         let chart = half_cylinder();
-        let input =
-            DrawInput { chart: &chart, points: None, frame: &ScanFrame::local(), section_offsets_m: Some(&[0.0]) };
+        let input = DrawInput {
+            chart: &chart,
+            points: None,
+            frame: &ScanFrame::local(),
+            section_offsets_m: Some(&[0.0]),
+            design_offsets_m: None,
+        };
         let error = draw(&input, &Settings::default(), &mut InMemory::default()).unwrap_err();
         assert!(matches!(error, Error::Length { found: 1, .. }));
     }

@@ -27,6 +27,10 @@ pub enum Layer {
     Xyz,
     /// Face and barycentric weights (second and third corner) of each pixel in `chart.ply`.
     SurfacePoint,
+    /// Signed distance from the design profile in metres, positive where rock stands inside it.
+    DesignOffset,
+    /// Root mean square of the height over the plane that fits best in a window, metres.
+    Roughness,
 }
 
 impl Layer {
@@ -42,6 +46,8 @@ impl Layer {
             Layer::Relief => "relief",
             Layer::Xyz => "xyz",
             Layer::SurfacePoint => "surface_point",
+            Layer::DesignOffset => "design_offset",
+            Layer::Roughness => "roughness",
         }
     }
 }
@@ -77,7 +83,8 @@ pub enum Samples {
 }
 
 /// A value that stands for "nothing here".
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum NoData {
     /// This value in every band.
     Value(f64),
@@ -97,7 +104,8 @@ pub enum Resampling {
 }
 
 /// How a layer looks as a picture.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Look {
     /// The samples are red, green, blue, alpha.
     Rgba,
@@ -223,16 +231,22 @@ impl Samples {
 impl LayerDescription {
     /// The picture of some samples of this layer: red, green, blue, alpha of each pixel. Empty for [`Look::None`].
     pub fn picture(&self, samples: &Samples) -> Vec<[u8; 4]> {
-        let bands = self.bands.len();
+        self.look.picture(samples, self.bands.len(), self.no_data)
+    }
+}
+
+impl Look {
+    /// The picture of samples with so many bands: red, green, blue, alpha of each pixel. Empty for [`Look::None`].
+    pub fn picture(&self, samples: &Samples, bands: usize, no_data: NoData) -> Vec<[u8; 4]> {
         let pixels = samples.len() / bands;
         let opaque = |[r, g, b]: [u8; 3]| [r, g, b, 255];
         let transparent = [0; 4];
-        let is_data = |x: f64| match self.no_data {
+        let is_data = |x: f64| match no_data {
             NoData::Value(none) => x != none,
             NoData::Nan => !x.is_nan(),
             NoData::Alpha => true,
         };
-        match &self.look {
+        match self {
             Look::None => Vec::new(),
             Look::Rgba => match samples {
                 Samples::U8(v) => v.as_chunks::<4>().0.to_vec(),

@@ -8,13 +8,19 @@
 mod blend;
 mod color_ramp;
 mod distortion_plot;
+mod design_profile;
 mod draw;
 mod grid;
 mod layer;
+mod legend;
 mod overview;
+pub mod qgis;
 mod rasterize;
+mod reference_lines;
 mod relief;
+mod roughness;
 mod sampling;
+pub mod sheet;
 pub(crate) mod stroke_font;
 
 #[cfg(test)]
@@ -22,6 +28,7 @@ pub(crate) mod example;
 
 pub use blend::Support;
 pub use color_ramp::{Ramp, label_color};
+pub use design_profile::{DesignProfile, ProfileError};
 pub use distortion_plot::distortion_histogram;
 pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, automatic_max_offset_m, draw};
 pub use grid::{Grid, PixelRect, Placement, TILE_PX, automatic_cell_m};
@@ -29,12 +36,15 @@ pub use layer::{
     COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, FILLED_COLOR, Layer, LayerDescription, Look, NoData,
     OBSERVED_COLOR, PaletteEntry, Resampling, SampleType, Samples, UNLABELLED_COLOR, color_distance, palette,
 };
+pub use legend::{Legend, LegendLayer, Swatch};
 pub use overview::{Picture, chainage_label, overview};
 pub use rasterize::{FaceIndex, NO_FACE, SurfaceTile};
+pub use reference_lines::{Feet, LineKind, ReferenceLine, reference_lines};
 
 use crate::warning::Warning;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 
 /// How the map is drawn.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -51,6 +61,13 @@ pub struct Settings {
     pub max_offset_m: Option<f64>,
     /// The layers to draw. `relief` is added when the scan has no colour.
     pub layers: Vec<Layer>,
+    /// Whether to write web tiles (`map/tiles/<layer>/<z>/<x>/<y>.png`) and a viewer, `map/tiles/index.html`.
+    pub tiles: bool,
+    /// The outline that the tunnel should have, for the layer `design_offset`: a CSV file of `right_m,up_m`, corners of a
+    /// closed polygon around the axis.
+    pub design_profile: Option<PathBuf>,
+    /// Width of the window of the layer `roughness`, metres: what is larger counts as shape.
+    pub roughness_window_m: f64,
 }
 
 impl Default for Settings {
@@ -67,6 +84,9 @@ impl Default for Settings {
                 Layer::Coverage,
                 Layer::Distortion,
             ],
+            tiles: false,
+            design_profile: None,
+            roughness_window_m: 0.5,
         }
     }
 }
@@ -81,6 +101,17 @@ pub enum Error {
         /// The size asked for.
         cell_m: f64,
     },
+    /// The window of the roughness is not a positive number.
+    #[error(
+        "a roughness cannot be measured in windows of {window_m} m; set map.roughness_window_m to a positive number such as 0.5"
+    )]
+    Window {
+        /// The width asked for.
+        window_m: f64,
+    },
+    /// The design profile cannot be used.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
     /// The grid has too many pixels.
     #[error("a map of {extent_u_m:.1} x {extent_v_m:.1} m has too many pixels of {cell_m} m; set a larger map.cell_m")]
     GridTooLarge {

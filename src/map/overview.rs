@@ -1,11 +1,12 @@
 //! The picture that a person opens first: the map with chainages, crown line, L / CROWN / R and a scale bar.
 //!
-//! Long tunnels are wrapped into rows, so that the picture keeps a shape that a screen can show. The base is the colour
+//! Long tunnels are wrapped into rows of equal length, so that the picture keeps a shape that a screen can show. The base is the colour
 //! of the scan; without colour its intensity under a light from the upper left, without intensity the shaded relief.
 
 use super::draw::{DrawInput, Piece, Sink, SinkError, draw};
 use super::grid::next_in_series;
 use super::layer::{Layer, LayerDescription};
+use super::reference_lines::{LineKind, ReferenceLine};
 use super::stroke_font::{Align, TextStyle, draw_text, paint, stroke_path, text_width};
 use super::{Error, Grid, Settings, Summary};
 use crate::numeric::Vec2;
@@ -16,9 +17,14 @@ const ROW_ASPECT: f64 = 3.2;
 /// Columns of map wanted in a row, and most rows of pixels of the whole picture.
 const ROW_PX: f64 = 4200.0;
 const MAX_HEIGHT_PX: f64 = 14_000.0;
+/// A small map is drawn with finer pixels than it has, at least a quarter, so that a row has this many columns.
+const SMALL_ROW_PX: f64 = 2000.0;
+const FINER: f64 = 4.0;
 
 const INK: [u8; 4] = [34, 38, 44, 255];
 const FAINT: [u8; 4] = [34, 38, 44, 150];
+const LIGHT: [u8; 4] = [255, 255, 255, 225];
+const SHADE: [u8; 4] = [0, 0, 0, 120];
 const GRID_SHADOW: [u8; 4] = [0, 0, 0, 50];
 const HATCH: [u8; 3] = [196, 200, 206];
 const HATCH_GROUND: [u8; 3] = [240, 241, 243];
@@ -34,11 +40,16 @@ pub struct Picture {
     pub rgba: Vec<u8>,
 }
 
-/// Draws the overview of a map that was drawn with `settings` and gave `summary`.
+/// Draws the overview of a map that was drawn with `settings` and gave `summary`, with its reference lines.
 ///
 /// # Errors
 /// As [`draw`].
-pub fn overview(input: &DrawInput, settings: &Settings, summary: &Summary) -> Result<Picture, Error> {
+pub fn overview(
+    input: &DrawInput,
+    settings: &Settings,
+    summary: &Summary,
+    lines: &[ReferenceLine],
+) -> Result<Picture, Error> {
     let (low, high) = (
         Vec2::new(summary.u_min_m, summary.v_max_m - summary.height_px as f64 * summary.cell_m),
         Vec2::new(summary.u_min_m + summary.width_px as f64 * summary.cell_m, summary.v_max_m),
@@ -51,16 +62,12 @@ pub fn overview(input: &DrawInput, settings: &Settings, summary: &Summary) -> Re
     } else {
         layers.extend([Layer::Intensity, Layer::Relief].into_iter().filter(|&l| has(l)));
     }
-    let base_settings = Settings {
-        cell_m: Some(plan.cell_m),
-        fill_m: settings.fill_m,
-        max_offset_m: Some(summary.max_offset_m),
-        layers,
-    };
+    let base_settings =
+        Settings { cell_m: Some(plan.cell_m), max_offset_m: Some(summary.max_offset_m), layers, ..settings.clone() };
     let mut base = BasePicture::default();
     draw(input, &base_settings, &mut base)?;
     base.mark_holes();
-    Ok(plan.compose(&base))
+    Ok(plan.compose(&base, lines))
 }
 
 /// The base of the overview: one colour a pixel.
@@ -182,8 +189,10 @@ struct RowPlan {
     cell_m: f64,
     low: Vec2,
     high: Vec2,
+    /// Chainages where rows start and end: one more than rows.
+    cuts: Vec<f64>,
+    /// The longest row, metres.
     row_m: f64,
-    rows: usize,
     cap: f64,
     left: f64,
     right: f64,
@@ -197,31 +206,31 @@ impl RowPlan {
     fn new(low: Vec2, high: Vec2, map_cell_m: f64) -> Self {
         let extent = high - low;
         let wanted = (ROW_ASPECT * extent.y).max(1.0);
-        let (rows, row_m) = if extent.x <= 1.4 * wanted {
-            (1, extent.x)
-        } else {
-            // Whole multiples of ten metres (of one in pipes) make rows start at round chainages.
-            let unit = if wanted > 20.0 { 10.0 } else { 1.0 };
-            let row_m = (wanted / unit).round().max(1.0) * unit;
-            let first = (low.x / row_m).floor() * row_m;
-            (((high.x - first) / row_m).ceil() as usize, row_m)
-        };
-        let fits_width = row_m / ROW_PX;
+        let rows = if extent.x <= 1.4 * wanted { 1 } else { (extent.x / wanted).ceil() as usize };
+        // Rows of equal length, cut at whole multiples of ten metres (of one in pipes).
+        let unit = if wanted > 20.0 { 10.0 } else { 1.0 };
+        let cut = |k: usize| ((low.x + extent.x * k as f64 / rows as f64) / unit).round() * unit;
+        let mut cuts = vec![low.x];
+        cuts.extend((1..rows).map(cut));
+        cuts.push(high.x);
+        let row_m = cuts.windows(2).map(|c| c[1] - c[0]).fold(0.0, f64::max);
         let fits_height = rows as f64 * extent.y * 1.3 / MAX_HEIGHT_PX;
+        let needed = (row_m / ROW_PX).max(fits_height);
+        let finer = map_cell_m.min(row_m / SMALL_ROW_PX).max(map_cell_m / FINER);
         // Whole millimetres; finer for models of a metre or so.
-        let wanted = fits_width.max(fits_height).max(1e-5);
+        let wanted = needed.max(finer).max(1e-5);
         let unit = if wanted > 1e-3 { 1000.0 } else { 1e5 };
-        let cell_m = map_cell_m.max((wanted * unit).ceil() / unit);
+        let cell_m = (wanted * unit - 1e-6).ceil() / unit;
         let row_px = row_m / cell_m;
-        let cap = (row_px / 110.0).clamp(9.0, 42.0);
+        let cap = (row_px / 110.0).clamp(11.0, 42.0);
         Self {
             cell_m,
             low,
             high,
+            cuts,
             row_m,
-            rows,
             cap,
-            left: 11.0 * cap,
+            left: 13.0 * cap,
             right: 7.0 * cap,
             head: 4.5 * cap,
             above: 2.0 * cap,
@@ -230,32 +239,27 @@ impl RowPlan {
         }
     }
 
-    /// First chainage of a row.
-    fn row_start(&self, row: usize) -> f64 {
-        if self.rows == 1 {
-            return self.low.x;
-        }
-        let first = (self.low.x / self.row_m).floor() * self.row_m;
-        first + row as f64 * self.row_m
+    fn rows(&self) -> usize {
+        self.cuts.len() - 1
     }
 
-    fn compose(&self, base: &BasePicture) -> Picture {
+    fn compose(&self, base: &BasePicture, lines: &[ReferenceLine]) -> Picture {
         let map_height = (self.high.y - self.low.y) / self.cell_m;
         // A narrow map still has room for its texts.
-        let row_px = (self.row_m / self.cell_m).max(text_width(VIEW, self.cap) - self.left);
+        let row_px = (self.row_m / self.cell_m).max(text_width(VIEW, self.cap) + self.cap - self.right);
         let row_height = self.above + map_height + self.below;
         let width = (self.left + row_px + self.right).ceil() as u32;
-        let height = (self.head + self.rows as f64 * row_height + self.foot).ceil() as u32;
+        let height = (self.head + self.rows() as f64 * row_height + self.foot).ceil() as u32;
         let Some(mut pixmap) = Pixmap::new(width.max(1), height.max(1)) else {
             return Picture { width: 0, height: 0, rgba: vec![] };
         };
         pixmap.fill(tiny_skia::Color::WHITE);
-        for row in 0..self.rows {
+        for row in 0..self.rows() {
             let top = (self.head + row as f64 * row_height + self.above).round();
             self.paste(base, row, top, &mut pixmap);
-            self.annotate(row, top, map_height, &mut pixmap.as_mut());
+            self.annotate(row, top, map_height, lines, &mut pixmap.as_mut());
         }
-        let foot = self.head + self.rows as f64 * row_height + 1.2 * self.cap;
+        let foot = self.head + self.rows() as f64 * row_height + 1.2 * self.cap;
         self.head_and_foot(foot, row_px, &mut pixmap.as_mut());
         let rgba = pixmap.data().to_vec();
         Picture { width: width as usize, height: height as usize, rgba }
@@ -264,8 +268,8 @@ impl RowPlan {
     /// Copies the pixels of a row of map.
     fn paste(&self, base: &BasePicture, row: usize, top: f64, pixmap: &mut Pixmap) {
         let Some(grid) = base.grid else { return };
-        let from = ((self.row_start(row) - grid.u_min()) / self.cell_m).round() as i64;
-        let columns = (self.row_m / self.cell_m).ceil() as i64;
+        let from = ((self.cuts[row] - grid.u_min()) / self.cell_m).round() as i64;
+        let columns = ((self.cuts[row + 1] - self.cuts[row]) / self.cell_m).ceil() as i64;
         let (left, stride) = (self.left.round() as usize, pixmap.width() as usize);
         let hatch_period = (self.cap * 0.6).round().max(6.0) as usize;
         let data = pixmap.data_mut();
@@ -288,11 +292,10 @@ impl RowPlan {
     }
 
     /// Frame, ticks, chainages, crown line and margins of a row.
-    fn annotate(&self, row: usize, top: f64, map_height: f64, canvas: &mut PixmapMut) {
+    fn annotate(&self, row: usize, top: f64, map_height: f64, lines: &[ReferenceLine], canvas: &mut PixmapMut) {
         let cap = self.cap;
-        let start = self.row_start(row);
-        let (u0, u1) = (start.max(self.low.x), (start + self.row_m).min(self.high.x));
-        let x_of = |u: f64| self.left + (u - start) / self.cell_m;
+        let (u0, u1) = (self.cuts[row], self.cuts[row + 1]);
+        let x_of = |u: f64| self.left + (u - u0) / self.cell_m;
         let y_of = |v: f64| top + (self.high.y - v) / self.cell_m;
         let (x0, x1, bottom) = (x_of(u0), x_of(u1), top + map_height);
         let thin = (cap * 0.07).max(1.0);
@@ -301,7 +304,7 @@ impl RowPlan {
         // Chainage: a tick each step, a line and a label each so many.
         let (tick_m, label_m) = tick_steps(self.row_m, cap * self.cell_m);
         let mut ticks = PathBuilder::new();
-        let mut lines = PathBuilder::new();
+        let mut verticals = PathBuilder::new();
         for k in (u0 / tick_m).ceil() as i64..=(u1 / tick_m).floor() as i64 {
             let u = k as f64 * tick_m;
             let x = x_of(u);
@@ -311,7 +314,7 @@ impl RowPlan {
             segment(&mut ticks, x, top, x, top - length);
             if is_label {
                 draw_text(canvas, &chainage_label(u), Vec2::new(x, bottom + 2.4 * cap), &text(Align::Middle));
-                segment(&mut lines, x, top, x, bottom);
+                segment(&mut verticals, x, top, x, bottom);
             }
         }
         // Girth: every metre or so at the right edge, labelled.
@@ -324,35 +327,54 @@ impl RowPlan {
             let label = if k == 0 { "0 m".to_owned() } else { format!("{v:+}") };
             draw_text(canvas, &label, Vec2::new(x1 + 1.2 * cap, y + 0.5 * cap), &text(Align::Start));
         }
-        draw_lines(canvas, lines, thin, GRID_SHADOW);
+        draw_lines(canvas, verticals, thin, GRID_SHADOW);
         draw_lines(canvas, ticks, thin, INK);
 
-        // The crown: dashes, dark under light, to be seen on any wall.
-        let crown = y_of(0.0);
-        if crown > top && crown < bottom {
-            let mut dashes = PathBuilder::new();
-            let (dash, gap) = (1.2 * cap, 0.8 * cap);
-            let mut x = x0;
-            while x < x1 {
-                segment(&mut dashes, x, crown, (x + dash).min(x1), crown);
-                x += dash + gap;
+        // Reference lines: light over dark, to be seen on any wall. Their names stand where they meet the left edge.
+        let mut named = Vec::new();
+        for line in lines {
+            let pattern: &[f64] = match line.kind {
+                LineKind::Crown => &[1.2, 0.8],
+                LineKind::SpringlineLeft | LineKind::SpringlineRight => &[0.9, 0.5, 0.15, 0.5],
+                LineKind::FootLeft | LineKind::FootRight => &[],
+            };
+            let pattern: Vec<f64> = pattern.iter().map(|p| p * cap).collect();
+            let pixels = |p: &[f64; 2]| Vec2::new(x_of(p[0]), y_of(p[1]));
+            let mut path = PathBuilder::new();
+            for piece in &line.pieces {
+                let inside: Vec<Vec2> = piece.iter().filter(|p| p[0] >= u0 && p[0] <= u1).map(pixels).collect();
+                dashed(&mut path, &inside, &pattern);
+                if let Some(first) = inside.first().filter(|p| p.x < x0 + 4.0 * cap) {
+                    named.push((line.kind, first.y));
+                }
             }
-            let under = dashes.clone();
-            draw_lines(canvas, under, 2.2 * thin, [0, 0, 0, 110]);
-            draw_lines(canvas, dashes, 1.1 * thin, [255, 255, 255, 230]);
+            draw_lines(canvas, path.clone(), 2.2 * thin, SHADE);
+            draw_lines(canvas, path, 1.1 * thin, LIGHT);
         }
-        // Margins.
-        let big = 1.5 * cap;
-        let margin = |canvas: &mut PixmapMut, name: &str, y: f64, size: f64| {
+        // Margins: names of lines that keep a distance from each other, the crown's first.
+        let crown = y_of(0.0);
+        let shows_crown = crown > top && crown < bottom;
+        if shows_crown && !named.iter().any(|n| n.0 == LineKind::Crown) {
+            named.push((LineKind::Crown, crown));
+        }
+        named.sort_by_key(|n| n.0);
+        let margin = |canvas: &mut PixmapMut, name: &str, x: f64, y: f64, size: f64| {
             let style = TextStyle { cap_px: size, align: Align::End, color: INK, upwards: false };
-            draw_text(canvas, name, Vec2::new(x0 - 1.3 * cap, y + 0.5 * size), &style);
+            draw_text(canvas, name, Vec2::new(x, y + 0.5 * size), &style);
         };
-        if crown > top && crown < bottom {
-            margin(canvas, "CROWN", crown, cap);
-            margin(canvas, "R", (top + crown) / 2.0, big);
-            margin(canvas, "L", (crown + bottom) / 2.0, big);
+        let mut taken: Vec<f64> = Vec::new();
+        for (kind, y) in named {
+            if taken.iter().all(|t| (t - y).abs() > 1.5 * cap) {
+                margin(canvas, kind.label(), x0 - 1.3 * cap, y, cap);
+                taken.push(y);
+            }
+        }
+        let (big, wall) = (1.5 * cap, x0 - 9.0 * cap);
+        if shows_crown {
+            margin(canvas, "R", wall, (top + crown) / 2.0, big);
+            margin(canvas, "L", wall, (crown + bottom) / 2.0, big);
         } else {
-            margin(canvas, if crown >= bottom { "R" } else { "L" }, (top + bottom) / 2.0, big);
+            margin(canvas, if crown >= bottom { "R" } else { "L" }, wall, (top + bottom) / 2.0, big);
         }
         let mut frame = PathBuilder::new();
         for (a, b, c, d) in [(x0, top, x1, top), (x1, top, x1, bottom), (x1, bottom, x0, bottom), (x0, bottom, x0, top)]
@@ -447,6 +469,29 @@ fn metres(length_m: f64) -> String {
     format!("{length_m} m")
 }
 
+/// Adds a polyline in dashes and gaps of the given lengths (none: solid).
+fn dashed(path: &mut PathBuilder, points: &[Vec2], pattern: &[f64]) {
+    let (mut part, mut left) = (0, pattern.first().copied().unwrap_or(f64::INFINITY));
+    for pair in points.windows(2) {
+        let length = (pair[1] - pair[0]).norm();
+        let at = |s: f64| pair[0] + (pair[1] - pair[0]) * (s / length.max(1e-12));
+        let mut done = 0.0;
+        while done < length {
+            let step = left.min(length - done);
+            if part % 2 == 0 {
+                let (a, b) = (at(done), at(done + step));
+                segment(path, a.x, a.y, b.x, b.y);
+            }
+            done += step;
+            left -= step;
+            if left <= 1e-9 {
+                part = (part + 1) % pattern.len().max(1);
+                left = pattern[part];
+            }
+        }
+    }
+}
+
 fn segment(path: &mut PathBuilder, x0: f64, y0: f64, x1: f64, y1: f64) {
     path.move_to(x0 as f32, y0 as f32);
     path.line_to(x1 as f32, y1 as f32);
@@ -480,10 +525,26 @@ mod tests {
     #[test]
     fn long_tunnels_are_wrapped_into_rows() {
         let short = RowPlan::new(Vec2::new(0.0, -12.0), Vec2::new(41.0, 12.0), 0.005);
-        assert_eq!((short.rows, short.cell_m), (1, 0.01));
+        assert_eq!((short.rows(), short.cell_m), (1, 0.01));
         let long = RowPlan::new(Vec2::new(100.0, -12.0), Vec2::new(1100.0, 12.0), 0.005);
-        assert!(long.rows > 10 && long.row_m == 80.0 && long.row_start(0) == 80.0);
-        assert!(long.rows as f64 * 24.0 / long.cell_m < MAX_HEIGHT_PX);
+        assert!(long.rows() > 10 && long.row_m <= 80.0 && long.cuts[1] % 10.0 == 0.0);
+        assert!(long.rows() as f64 * 24.0 / long.cell_m < MAX_HEIGHT_PX);
+    }
+
+    #[test]
+    fn a_pipe_that_starts_before_zero_has_no_sliver_of_a_row() {
+        let pipe = RowPlan::new(Vec2::new(-0.06, -1.5), Vec2::new(20.6, 1.45), 0.02);
+        assert_eq!(pipe.cuts, [-0.06, 7.0, 14.0, 20.6]);
+        // Drawn finer than the map, so that its texts can be read.
+        assert!(pipe.cell_m < 0.01 && pipe.cell_m >= 0.005);
+    }
+
+    #[test]
+    fn dashes_go_on_around_corners() {
+        let mut path = PathBuilder::new();
+        dashed(&mut path, &[Vec2::zeros(), Vec2::new(3.0, 0.0), Vec2::new(3.0, 4.0)], &[2.0, 2.0]);
+        let bounds = path.finish().unwrap().bounds();
+        assert_eq!((bounds.right(), bounds.bottom()), (3.0, 3.0));
     }
 
     #[test]

@@ -58,6 +58,7 @@ fn strokes(character: char) -> &'static str {
         '.' => "0d0d",
         ',' => "1d0b",
         ':' => "0e0e 0i0i",
+        ';' => "1e1e0b 1i1i",
         '/' => "0c4m",
         '(' => "2n0k0d2b",
         ')' => "0n2k2d0b",

@@ -31,7 +31,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "clean", version: 1, needs: &["ingest"] },
     Stage { name: "axis", version: 1, needs: &["clean"] },
     Stage { name: "segment", version: 1, needs: &["clean", "axis"] },
-    Stage { name: "mesh", version: 1, needs: &["segment", "axis"] },
+    Stage { name: "mesh", version: 2, needs: &["segment", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
@@ -43,7 +43,7 @@ pub const STAGES: &[Stage] = &[
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 1, needs: &["ingest"] },
-    Stage { name: "mesh", version: 1, needs: &["ingest", "axis"] },
+    Stage { name: "mesh", version: 2, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
@@ -71,6 +71,8 @@ pub struct Outcome {
 struct Surface {
     mesh: Mesh,
     section: SectionField,
+    /// Where the walls meet the floor; empty without a floor.
+    feet: Vec<map::Feet>,
 }
 
 /// What to do again although it is there.
@@ -127,6 +129,7 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
     let poses_hash = hash_inputs(pipeline.ingest.poses.as_slice())?;
     let handles_file = pipeline.unwrap.method.handles_file();
     let handles_hash = hash_inputs(handles_file.map(std::slice::from_ref).unwrap_or_default())?;
+    let profile_hash = hash_inputs(pipeline.map.design_profile.as_slice())?;
     let from_mesh = is_mesh(&pipeline.input)?;
     let stages = if from_mesh { MESH_STAGES } else { STAGES };
     let plans = line::plan(
@@ -139,6 +142,7 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
             }
             "axis" => alignment_hash.iter().map(|h| ("alignment".to_owned(), h.clone())).collect(),
             "unwrap" => handles_hash.iter().map(|h| ("handles".to_owned(), h.clone())).collect(),
+            "map" => profile_hash.iter().map(|h| ("design profile".to_owned(), h.clone())).collect(),
             _ => BTreeMap::new(),
         },
     );
@@ -209,7 +213,8 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
         let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
         summary["profiles"] = profiles(&segmentation.section);
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
-        Ok((Surface { mesh, section: segmentation.section.clone() }, summary))
+        let feet = feet(&segmentation);
+        Ok((Surface { mesh, section: segmentation.section.clone(), feet }, summary))
     });
     if until == Until::Surface {
         axis.ensure()?;
@@ -244,14 +249,15 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
     let map = line.passing("map", |staging| {
         let (cloud, chart, axis, surface) = (cloud.get()?, chart.get()?, axis.get()?, surface.get()?);
         let placed = placed.get()?;
-        let offsets = section_offsets(chart.strip().mesh(), &axis, &surface.section);
+        let around = around_the_axis(pipeline, &chart, &axis, &surface)?;
         let input = map::DrawInput {
             chart: &chart,
             points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
             frame: cloud.frame(),
-            section_offsets_m: Some(&offsets),
+            section_offsets_m: Some(&around.section_offsets_m),
+            design_offsets_m: around.design_offsets_m.as_deref(),
         };
-        draw_map(pipeline, &input, staging)
+        draw_map(pipeline, &input, &around.lines, staging)
     });
     let points = line.passing("points", |staging| {
         let (cloud, placed) = (cloud.get()?, placed.get()?);
@@ -299,7 +305,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
             "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
             "profiles": profiles(&section), "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
         });
-        Ok((Surface { mesh, section }, summary))
+        Ok((Surface { mesh, section, feet: vec![] }, summary))
     });
     let strip =
         line.passing("cut", |_| done("cut", cut::open(surface.get()?.mesh.clone(), &*axis.get()?, &pipeline.cut)));
@@ -313,10 +319,16 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
     });
     let map = line.passing("map", |staging| {
         let (chart, surface) = (chart.get()?, surface.get()?);
-        let offsets = section_offsets(chart.strip().mesh(), &*axis.get()?, &surface.section);
+        let around = around_the_axis(pipeline, &chart, &*axis.get()?, &surface)?;
         let frame = raw.get()?.frame.clone();
-        let input = map::DrawInput { chart: &chart, points: None, frame: &frame, section_offsets_m: Some(&offsets) };
-        draw_map(pipeline, &input, staging)
+        let input = map::DrawInput {
+            chart: &chart,
+            points: None,
+            frame: &frame,
+            section_offsets_m: Some(&around.section_offsets_m),
+            design_offsets_m: around.design_offsets_m.as_deref(),
+        };
+        draw_map(pipeline, &input, &around.lines, staging)
     });
     axis.ensure()?;
     surface.ensure()?;
@@ -346,13 +358,20 @@ fn read_handles(pipeline: &Pipeline, frame: &ScanFrame) -> Result<Vec<unwrap::Ha
 }
 
 /// Draws all layers and the overview into the folder `map` of the staging folder.
-fn draw_map(pipeline: &Pipeline, input: &map::DrawInput, staging: &Path) -> Result<((), serde_json::Value), Error> {
+fn draw_map(
+    pipeline: &Pipeline,
+    input: &map::DrawInput,
+    lines: &[map::ReferenceLine],
+    staging: &Path,
+) -> Result<((), serde_json::Value), Error> {
     let folder = staging.join("map");
     std::fs::create_dir(&folder).map_err(cannot_write("map", &folder))?;
-    let mut sink = io::MapFolder::new(&folder);
+    let mut sink = io::MapFolder::new(&folder).with_tiles(pipeline.map.tiles);
     let summary = map::draw(input, &pipeline.map, &mut sink).map_err(Error::in_stage("map"))?;
-    let picture = map::overview(input, &pipeline.map, &summary).map_err(Error::in_stage("map"))?;
-    io::write_picture(&folder.join("map.png"), &picture)
+    let text = serde_json::to_string(lines).expect("lines are plain data");
+    write_text("map", &folder.join("lines.json"), &format!("{text}\n"))?;
+    let picture = map::overview(input, &pipeline.map, &summary, lines).map_err(Error::in_stage("map"))?;
+    io::write_picture(&folder.join("map.png"), &picture, None)
         .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))?;
     let faces = unwrap::distortion::of_faces(input.chart.strip().mesh(), input.chart.uv());
     write_text("map", &folder.join("distortion_histogram.svg"), &map::distortion_histogram(&faces))?;
@@ -414,10 +433,11 @@ impl Checkpoint for Surface {
     fn save(&self, columns: &mut checkpoint::Writer) {
         self.mesh.save(columns);
         self.section.save(columns);
+        columns.put("feet", &self.feet);
     }
 
     fn load(columns: &checkpoint::Reader) -> Result<Self, checkpoint::Error> {
-        Ok(Self { mesh: Mesh::load(columns)?, section: SectionField::load(columns)? })
+        Ok(Self { mesh: Mesh::load(columns)?, section: SectionField::load(columns)?, feet: columns.get("feet")? })
     }
 }
 
@@ -472,13 +492,47 @@ fn profiles(section: &SectionField) -> serde_json::Value {
     (0..PROFILES).map(at).collect()
 }
 
-/// Distance of each vertex from the local mean section, metres, positive into the void.
-fn section_offsets(mesh: &Mesh, axis: &Axis, section: &SectionField) -> Vec<f64> {
-    let offset = |p| {
-        let c = axis.project(p);
-        section.radius(c.chainage, c.angle()) - c.radius()
+/// What the map shows of the place of the surface around the axis.
+struct AroundTheAxis {
+    /// Distance of each vertex from the local mean section, metres, positive into the void.
+    section_offsets_m: Vec<f64>,
+    /// Distance of each vertex from the design profile, if one is given, metres, positive inside it.
+    design_offsets_m: Option<Vec<f64>>,
+    /// The lines of the section on the chart; a shaft has neither crown nor springlines.
+    lines: Vec<map::ReferenceLine>,
+}
+
+fn around_the_axis(pipeline: &Pipeline, chart: &Chart, axis: &Axis, surface: &Surface) -> Result<AroundTheAxis, Error> {
+    let coordinates: Vec<AxisCoordinates> =
+        chart.strip().mesh().vertices().par_iter().map(|p| axis.project(p)).collect();
+    let offset = |c: &AxisCoordinates| surface.section.radius(c.chainage, c.angle()) - c.radius();
+    let design_offsets_m = match &pipeline.map.design_profile {
+        None => None,
+        Some(path) => {
+            let text = std::fs::read_to_string(path)
+                .map_err(|source| Error::in_stage("map")(io::Error::Read { path: path.clone(), source }))?;
+            let profile = map::DesignProfile::parse(&text).map_err(|e| Error::in_stage("map")(map::Error::from(e)))?;
+            Some(coordinates.par_iter().map(|c| profile.offset(c)).collect())
+        }
     };
-    mesh.vertices().par_iter().map(offset).collect()
+    let lines = if axis.is_shaft() {
+        vec![]
+    } else {
+        map::reference_lines(chart, &coordinates, &surface.section, &surface.feet)
+    };
+    Ok(AroundTheAxis { section_offsets_m: coordinates.par_iter().map(offset).collect(), design_offsets_m, lines })
+}
+
+/// Angles of the feet of the walls, every metre.
+fn feet(segmentation: &segment::Segmentation) -> Vec<map::Feet> {
+    let (section, Some(floor)) = (&segmentation.section, &segmentation.floor) else { return vec![] };
+    let steps = (section.end() - section.start()).ceil().max(1.0) as usize;
+    let at = |i: usize| {
+        let chainage = section.start() + (section.end() - section.start()) * i as f64 / steps as f64;
+        let [left, right] = floor.feet(chainage).map(|girth| section.angle_of_girth(chainage, girth));
+        [chainage, left, right]
+    };
+    (0..=steps).map(at).collect()
 }
 
 /// The axis as `axis.csv`, scan coordinates.

@@ -90,7 +90,7 @@ impl Pipeline {
         let text = std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         let mut pipeline = Self::parse(&text, &path.display().to_string(), overrides)?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        let more = [&mut pipeline.axis.alignment, &mut pipeline.ingest.poses];
+        let more = [&mut pipeline.axis.alignment, &mut pipeline.ingest.poses, &mut pipeline.map.design_profile];
         let handles = pipeline.unwrap.method.handles_file_mut();
         for named in pipeline.input.iter_mut().chain(more.into_iter().flatten()).chain(handles) {
             *named = folder.join(&*named);
@@ -146,7 +146,7 @@ impl Pipeline {
 
     /// Replaces relative input paths by absolute ones, so that the resolved pipeline means the same everywhere.
     pub fn make_inputs_absolute(&mut self) {
-        let more = [&mut self.axis.alignment, &mut self.ingest.poses];
+        let more = [&mut self.axis.alignment, &mut self.ingest.poses, &mut self.map.design_profile];
         let handles = self.unwrap.method.handles_file_mut();
         for input in self.input.iter_mut().chain(more.into_iter().flatten()).chain(handles) {
             // Only an empty path or a vanished working folder has no absolute form; reading it will say so.
