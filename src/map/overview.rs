@@ -17,9 +17,9 @@ const ROW_ASPECT: f64 = 3.2;
 /// Columns of map wanted in a row, and most rows of pixels of the whole picture.
 const ROW_PX: f64 = 4200.0;
 const MAX_HEIGHT_PX: f64 = 14_000.0;
-/// A small map is drawn with finer pixels than it has, at least a quarter, so that a row has this many columns.
+/// A small map is drawn with finer pixels than it has, at least half as large, so that a row has this many columns.
 const SMALL_ROW_PX: f64 = 2000.0;
-const FINER: f64 = 4.0;
+const FINER: f64 = 2.0;
 
 const INK: [u8; 4] = [34, 38, 44, 255];
 const FAINT: [u8; 4] = [34, 38, 44, 150];
@@ -536,7 +536,7 @@ mod tests {
         let pipe = RowPlan::new(Vec2::new(-0.06, -1.5), Vec2::new(20.6, 1.45), 0.02);
         assert_eq!(pipe.cuts, [-0.06, 7.0, 14.0, 20.6]);
         // Drawn finer than the map, so that its texts can be read.
-        assert!(pipe.cell_m < 0.01 && pipe.cell_m >= 0.005);
+        assert_eq!(pipe.cell_m, 0.01);
     }
 
     #[test]
