@@ -72,7 +72,11 @@ impl Console {
     /// A failure with its causes; always shown.
     pub fn failure(&self, failure: &Failure) {
         self.finish_bar();
-        self.log("error", &failure.line(), &[("exit_code", serde_json::json!(failure.exit as u8))]);
+        let fields = [
+            ("exit_code", serde_json::json!(failure.exit as u8)),
+            ("peak_memory_bytes", serde_json::json!(crate::pipeline::peak_memory_bytes())),
+        ];
+        self.log("error", &failure.line(), &fields);
     }
 
     /// A line with fields: text for people, a JSON object with `--log-json`.

@@ -1,7 +1,7 @@
 //! `adit run`: the whole pipeline.
 
 use super::{Console, Exit, Failure, Result};
-use crate::pipeline::{self, Kind, Observer, Pipeline, Redo, STAGES, limits::Status, report};
+use crate::pipeline::{self, Kind, Observer, Options, Pipeline, Redo, STAGES, limits::Status, preflight, report};
 use crate::warning::Warning;
 use serde_json::json;
 use std::path::PathBuf;
@@ -12,10 +12,28 @@ Examples:
   adit run --input station1.e57 --input station2.e57 --out runs/drift --set map.cell_m=0.005
   adit run pipelines/nightly.toml --input drift.laz --out runs/drift --set unwrap=lscm
   adit run pipelines/quick.toml --check
+  adit run --input drift.laz --out /mnt/share/drift --memory 8G --tmp /var/tmp
+  adit run --input drift_tuesday.laz --out runs/tuesday --compare-with runs/monday
 
 The same command again does nothing; a changed key redoes what depends on it. An interrupted run goes on where it was.
 The run folder then holds report.json (numbers and verdict), map/ (rasters and pictures), points.laz (every point with
-chainage, girth and offset), mesh.ply, chart.ply, axis.csv and pipeline.toml (all settings that were used).";
+chainage, girth and offset), mesh.ply, chart.ply, axis.csv and pipeline.toml (all settings that were used).
+
+Before it begins, a run estimates its memory and disk from the headers of the scan; what will not fit ends at once with exit
+code 6. docs/nightly.md has the formula.";
+
+/// What a process may use; the same for run, watch and batch.
+#[derive(clap::Args)]
+pub(super) struct Resources {
+    /// Memory that may be used, e.g. 8G or 800M. What needs more is refused before it begins (exit code 6). Default: what
+    /// the machine (or the container) has free.
+    #[arg(long, value_name = "SIZE", value_parser = preflight::parse_size)]
+    pub(super) memory: Option<u64>,
+    /// A folder on a fast disk for checkpoints and unfinished products, e.g. when --out is a network share. Default: the run
+    /// folder.
+    #[arg(long, value_name = "DIR")]
+    pub(super) tmp: Option<PathBuf>,
+}
 
 /// Arguments of `adit run`.
 #[derive(clap::Args)]
@@ -39,6 +57,17 @@ pub struct Arguments {
     /// Do this stage and all after it again.
     #[arg(long, value_name = "STAGE")]
     from: Option<String>,
+    #[command(flatten)]
+    resources: Resources,
+    /// Run folder of an earlier, accepted run of the same tunnel: [limits.drift] judges the changes.
+    #[arg(long, value_name = "RUN_DIR")]
+    compare_with: Option<PathBuf>,
+    /// Hash that the scan had when it was taken: another one means that somebody writes to it.
+    #[arg(long, hide = true)]
+    expect_sha256: Option<String>,
+    /// End when standard input is closed: the process that started this one is gone.
+    #[arg(long, hide = true)]
+    end_with_stdin: bool,
     /// Only tell what would be done, and why.
     #[arg(long)]
     explain: bool,
@@ -70,12 +99,25 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     if arguments.explain {
         return super::explain::print(&pipeline::explain(&pipeline, &out)?, console);
     }
-    let redo = Redo {
-        all: arguments.force.as_ref().is_some_and(Vec::is_empty),
-        stages: arguments.force.unwrap_or_default(),
-        from: arguments.from,
+    if arguments.end_with_stdin {
+        std::thread::spawn(|| {
+            // Whatever ends the reading, nobody is there any more.
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            std::process::exit(i32::from(Exit::Cancelled as u8));
+        });
+    }
+    let options = Options {
+        redo: Redo {
+            all: arguments.force.as_ref().is_some_and(Vec::is_empty),
+            stages: arguments.force.unwrap_or_default(),
+            from: arguments.from,
+        },
+        memory_bytes: arguments.resources.memory,
+        tmp: arguments.resources.tmp,
+        compare_with: arguments.compare_with,
+        expect_sha256: arguments.expect_sha256,
     };
-    let outcome = pipeline::run(&pipeline, &out, &redo, &Progress { console })?;
+    let outcome = pipeline::run(&pipeline, &out, &options, &Progress { console })?;
     console.finish_bar();
     let mut lines = vec![format!("{} {}", headline(outcome.status), out.display())];
     lines.extend(report::summary_lines(&outcome.report));
@@ -90,7 +132,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
 
 fn headline(status: Status) -> &'static str {
     match status {
-        Status::Pass => "PASS",
+        Status::Pass | Status::Skipped => "PASS",
         Status::Warn => "PASS with warnings:",
         Status::Fail => "FAIL (a limit was broken; the products are kept):",
     }
@@ -125,6 +167,13 @@ impl Observer for Progress<'_> {
         let fields = [("stage", json!(stage)), ("seconds", json!(seconds)), ("reused", json!(reused))];
         if !self.console.is_quiet() {
             self.console.log("info", &text, &fields);
+        }
+    }
+
+    fn resumed(&self, stage: &str) {
+        if !self.console.is_quiet() {
+            let text = format!("the last run here ended during {stage}; going on from the last finished stage");
+            self.console.log("info", &text, &[("interrupted_stage", json!(stage))]);
         }
     }
 

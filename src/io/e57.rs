@@ -108,6 +108,19 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     Ok(scan.relative(origin))
 }
 
+/// How many points all scans of the file hold, from its header and its XML; the file must have its stated length.
+pub(super) fn announced_points(source: &SourceBytes) -> Result<u64, Error> {
+    let path = source.path();
+    let head = source.up_to(0, 24)?;
+    let length = head.get(16..24).map_or(u64::MAX, |b| u64::from_le_bytes(b.try_into().expect("eight bytes")));
+    super::announce::must_hold(source, length, "its header")?;
+    let file = File::open(path).map_err(|e| Error::read(path, e))?;
+    let reader = E57Reader::new(BufReader::new(file)).map_err(|e| Error::bad(path, e.to_string(), COPY_AGAIN))?;
+    let clouds = reader.pointclouds();
+    clouds.iter().enumerate().try_for_each(|(index, cloud)| check_size(source, index, cloud))?;
+    Ok(clouds.iter().map(|c| c.records).sum())
+}
+
 fn check_label_setting(path: &std::path::Path, settings: &Settings) -> Result<(), Error> {
     super::label_column::choose(path, settings, &[], false).map(|_| ())
 }

@@ -3,6 +3,7 @@
 //! Reading is complete and suspicious: no count in a header is believed before the file is known to hold it, panics in
 //! decoders end as bad input, and whatever is dropped, scaled or guessed is counted in the [`Summary`].
 
+mod announce;
 mod assemble;
 mod crs;
 mod detect;
@@ -37,6 +38,7 @@ pub mod world_file;
 mod text;
 mod write;
 
+pub use announce::{Announcement, announce};
 pub use assemble::{FileSummary, Summary, read_cloud};
 pub use error::{Error, ErrorKind};
 pub use file_scan::{AttributeInfo, Settings, Unit};

@@ -178,6 +178,17 @@ fn fill(
     table
 }
 
+/// How many points the header counts; a binary file must hold them.
+pub(super) fn announced_points(source: &SourceBytes) -> Result<u64, Error> {
+    let header = read_header(source)?;
+    if header.data == Data::Binary {
+        let stride: usize = header.fields.iter().map(|f| f.size * f.count).sum();
+        let needed = header.points.saturating_mul(stride as u64).saturating_add(header.data_at);
+        super::announce::must_hold(source, needed, "its point count")?;
+    }
+    Ok(header.points)
+}
+
 fn read_header(source: &SourceBytes) -> Result<Header, Error> {
     let head = source.up_to(0, 1 << 16)?;
     let bad = |cause: String| Error::bad(source.path(), cause, COPY_AGAIN);

@@ -1,6 +1,6 @@
 //! What keeps a run from finishing: which stage, what happened there, and whose problem it is.
 
-use super::{checkpoint, run_folder, settings};
+use super::{checkpoint, preflight, run_folder, settings};
 use crate::{axis, clean, cut, io, map, mesh, segment, unwrap};
 
 /// Whose problem an error is; the command line turns it into an exit code.
@@ -44,6 +44,15 @@ pub enum Error {
         /// All names.
         stages: String,
     },
+    /// The run would not fit into memory or on disk.
+    #[error(transparent)]
+    Preflight(#[from] preflight::Error),
+    /// An input was written to while it was read.
+    #[error("'{}' changed while it was read: run again when it has been copied completely", path.display())]
+    InputChanged {
+        /// The file.
+        path: std::path::PathBuf,
+    },
     /// The run folder cannot be used.
     #[error(transparent)]
     RunFolder(#[from] run_folder::Error),
@@ -64,6 +73,8 @@ impl Error {
     pub fn kind(&self) -> Kind {
         match self {
             Self::Settings(_) | Self::NoInput | Self::SeveralMeshes { .. } | Self::NoStage { .. } => Kind::Usage,
+            Self::Preflight(_) => Kind::Resources,
+            Self::InputChanged { .. } => Kind::BadInput,
             Self::RunFolder(error) => error.kind(),
             Self::Stage { kind, .. } => *kind,
         }

@@ -20,6 +20,10 @@ impl Levels {
         Self { warn: None, fail: Some(fail) }
     }
 
+    const fn warn_at(warn: f64) -> Self {
+        Self { warn: Some(warn), fail: None }
+    }
+
     const fn at(warn: f64, fail: f64) -> Self {
         Self { warn: Some(warn), fail: Some(fail) }
     }
@@ -64,7 +68,7 @@ impl<'de> Deserialize<'de> for Levels {
 }
 
 /// When a finished run counts as good. Each limit is a number (fails beyond it) or `{ warn = ..., fail = ... }`;
-/// an empty table `{}` switches a limit off.
+/// an empty table `{}` switches a limit off. What a run does not measure is reported as skipped, with the reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
@@ -86,8 +90,43 @@ pub struct Limits {
     pub lost_points: Levels,
     /// Most surface that no point supports, percent.
     pub filled_percent: Levels,
+    /// Least points on a square metre of surface that 95 % of the metres along the tunnel have.
+    pub density_per_m2: Levels,
+    /// Most scatter of the points about the surface (1.4826 times the median deviation), metres.
+    pub noise_m: Levels,
+    /// Most distance between the surfaces that two stations saw, metres.
+    pub station_residual_m: Levels,
+    /// Least length of the axis, metres.
+    pub length_m: Levels,
     /// Longest duration, seconds.
     pub duration_s: Levels,
+    /// Greatest memory, bytes.
+    pub peak_memory_bytes: Levels,
+    /// Most change against the last accepted run of the same tunnel.
+    pub drift: Drift,
+}
+
+/// Most change against the last accepted run of the same tunnel (`adit watch`, `adit batch`, `adit run --compare-with`).
+/// Without such a run these are skipped.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Drift {
+    /// Most loss of coverage, percentage points.
+    pub coverage_loss_percent: Levels,
+    /// Most growth of the distortion, percentage points.
+    pub distortion_growth_percent: Levels,
+    /// Most change of the axis' length, metres.
+    pub length_change_m: Levels,
+    /// Most change of the mean perimeter of the section, percent.
+    pub perimeter_change_percent: Levels,
+    /// Most change of the area of the surface, percent.
+    pub area_change_percent: Levels,
+    /// Most loss of points, percent.
+    pub points_loss_percent: Levels,
+    /// Most growth of the noise, percent.
+    pub noise_growth_percent: Levels,
+    /// Most growth of the duration, percent.
+    pub duration_growth_percent: Levels,
 }
 
 impl Default for Limits {
@@ -101,8 +140,30 @@ impl Default for Limits {
             roundtrip_pixels_px: Levels::fail_at(0.01),
             roundtrip_lines_m: Levels::fail_at(0.001),
             lost_points: Levels::fail_at(0.0),
-            filled_percent: Levels { warn: Some(10.0), fail: None },
+            filled_percent: Levels::warn_at(10.0),
+            density_per_m2: Levels::default(),
+            noise_m: Levels::warn_at(0.05),
+            station_residual_m: Levels::at(0.02, 0.05),
+            length_m: Levels::default(),
             duration_s: Levels::default(),
+            peak_memory_bytes: Levels::default(),
+            drift: Drift::default(),
+        }
+    }
+}
+
+impl Default for Drift {
+    /// Warnings only: a tunnel that is being driven grows, and that is no fault of the scan.
+    fn default() -> Self {
+        Self {
+            coverage_loss_percent: Levels::warn_at(5.0),
+            distortion_growth_percent: Levels::warn_at(5.0),
+            length_change_m: Levels::default(),
+            perimeter_change_percent: Levels::warn_at(5.0),
+            area_change_percent: Levels::default(),
+            points_loss_percent: Levels::warn_at(50.0),
+            noise_growth_percent: Levels::warn_at(50.0),
+            duration_growth_percent: Levels::default(),
         }
     }
 }
@@ -111,6 +172,8 @@ impl Default for Limits {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Status {
+    /// Not judged: no level is set, or the value was not measured; the message says which.
+    Skipped,
     /// Within all levels.
     Pass,
     /// Beyond a warning level.
@@ -123,6 +186,7 @@ impl Status {
     /// The word.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Skipped => "skipped",
             Self::Pass => "pass",
             Self::Warn => "warn",
             Self::Fail => "fail",
@@ -157,14 +221,32 @@ pub struct Check {
     pub fail: Option<f64>,
     /// How it came out.
     pub status: Status,
+    /// Chainage of the metre where the value is worst, where metres are told apart.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub worst_chainage_m: Option<f64>,
     /// One sentence for a person.
     pub message: String,
 }
 
+/// What a limit is about.
+#[derive(Clone, Copy, Debug)]
+pub struct Measure<'a> {
+    /// Name of the limit, as in the pipeline file.
+    pub name: &'a str,
+    /// What is measured, for a person.
+    pub what: &'a str,
+    /// Unit of the value.
+    pub unit: &'a str,
+    /// Which side of a level is good.
+    pub sense: Sense,
+}
+
 impl Check {
-    /// Judges a value.
-    pub fn of(name: &str, what: &str, unit: &str, sense: Sense, levels: Levels, value: Option<f64>) -> Self {
-        let beyond = |level: Option<f64>| match (level, value) {
+    /// Judges a value; one that was not measured (with the reason) is skipped.
+    pub fn of(measure: Measure, levels: Levels, value: Result<f64, &str>) -> Self {
+        let Measure { name, what, unit, sense } = measure;
+        let measured = value.ok();
+        let beyond = |level: Option<f64>| match (level, measured) {
             (Some(level), Some(value)) => match sense {
                 // A value that is not a number keeps to no level.
                 Sense::AtMost => !(value <= level),
@@ -172,7 +254,9 @@ impl Check {
             },
             _ => false,
         };
+        let no_level = levels.warn.is_none() && levels.fail.is_none();
         let status = match (beyond(levels.warn), beyond(levels.fail)) {
+            _ if measured.is_none() || no_level => Status::Skipped,
             (_, true) => Status::Fail,
             (true, false) => Status::Warn,
             (false, false) => Status::Pass,
@@ -184,28 +268,35 @@ impl Check {
         };
         let allowed = match if status == Status::Warn { levels.warn } else { levels.fail.or(levels.warn) } {
             Some(level) => format!(" ({bound} {}{spaced})", number(level)),
-            None => String::new(),
+            None => " (no level is set)".to_owned(),
         };
         let message = match value {
-            Some(value) => format!("{what}: {}{spaced}{allowed}", number(value)),
-            None => format!("{what}: not measured{allowed}"),
+            Ok(value) => format!("{what}: {}{spaced}{allowed}", number(value)),
+            Err(reason) => format!("{what}: not measured, {reason}{allowed}"),
         };
         Self {
             name: name.to_owned(),
-            value,
+            value: measured,
             unit: unit.to_owned(),
             sense,
             warn: levels.warn,
             fail: levels.fail,
             status,
+            worst_chainage_m: None,
             message,
         }
     }
+
+    /// The same check with the place where it is worst.
+    pub fn worst_at(mut self, chainage_m: Option<f64>) -> Self {
+        self.worst_chainage_m = chainage_m;
+        self
+    }
 }
 
-/// The worst status of the checks.
+/// The worst status of the checks; a run of which nothing was judged passes.
 pub fn verdict(checks: &[Check]) -> Status {
-    checks.iter().map(|c| c.status).max().unwrap_or(Status::Pass)
+    checks.iter().map(|c| c.status).fold(Status::Pass, Status::max)
 }
 
 /// A number for a person: four significant digits, no needless zeros.
@@ -228,14 +319,27 @@ pub fn number(value: f64) -> String {
 mod tests {
     use super::*;
 
+    fn judged(sense: Sense, levels: Levels, value: Result<f64, &str>) -> Check {
+        Check::of(Measure { name: "x", what: "the measure", unit: "m", sense }, levels, value)
+    }
+
     #[test]
     fn a_value_on_the_level_keeps_to_it() {
-        let flips =
-            |n| Check::of("flipped_faces", "flipped faces", "", Sense::AtMost, Levels::fail_at(0.0), Some(n)).status;
+        let flips = |n| judged(Sense::AtMost, Levels::fail_at(0.0), Ok(n)).status;
         assert_eq!((flips(0.0), flips(1.0)), (Status::Pass, Status::Fail));
-        let coverage = |c| Check::of("c", "coverage", "%", Sense::AtLeast, Levels::at(95.0, 90.0), Some(c)).status;
+        let coverage = |c| judged(Sense::AtLeast, Levels::at(95.0, 90.0), Ok(c)).status;
         assert_eq!((coverage(95.0), coverage(94.9), coverage(89.9)), (Status::Pass, Status::Warn, Status::Fail));
         assert_eq!(coverage(f64::NAN), Status::Fail);
+    }
+
+    #[test]
+    fn what_is_not_measured_is_skipped_with_its_reason() {
+        let check = judged(Sense::AtMost, Levels::at(1.0, 2.0), Err("there is one station"));
+        assert_eq!(check.status, Status::Skipped);
+        assert_eq!(check.message, "the measure: not measured, there is one station (at most 2 m)");
+        let check = judged(Sense::AtMost, Levels::default(), Ok(3.0));
+        assert_eq!((check.status, check.message.as_str()), (Status::Skipped, "the measure: 3 m (no level is set)"));
+        assert_eq!(verdict(&[check]), Status::Pass);
     }
 
     #[test]

@@ -34,6 +34,8 @@ pub trait Observer {
     fn finished(&self, stage: &'static str, seconds: f64, reused: bool);
     /// A stage has something to say.
     fn warned(&self, stage: &'static str, warning: &Warning);
+    /// The last process that worked in the folder died during this stage; the run goes on from there.
+    fn resumed(&self, stage: &str);
 }
 
 /// What decides a stage's result.
@@ -89,6 +91,10 @@ impl<'a> Line<'a> {
             }
         }
         Self { folder, observer, plans, records: records.into(), nested_seconds: 0.0.into(), worked: false.into() }
+    }
+
+    pub(super) fn folder(&self) -> &RunFolder {
+        self.folder
     }
 
     pub(super) fn plans(&self) -> &[Plan] {
@@ -197,6 +203,7 @@ impl<T> Product<'_, T> {
             line.folder.remove("report.json")?;
         }
         let staging = line.folder.staging(self.stage)?;
+        line.folder.note("stage-begun", serde_json::json!({ "stage": self.stage }))?;
         line.observer.started(self.stage);
         let (value, summary) = (self.make)(&staging)?;
         if !fresh {
@@ -230,6 +237,11 @@ impl<T> Product<'_, T> {
             line.records.borrow_mut().insert(self.stage, record);
             line.observer.finished(self.stage, seconds, false);
         }
+        if fresh {
+            // Its products are in place already.
+            line.folder.discard(&staging)?;
+        }
+        line.folder.note("stage-finished", serde_json::json!({ "stage": self.stage, "again": fresh }))?;
         line.nested_seconds.set(nested_before + begun.elapsed().as_secs_f64());
         Ok(value)
     }
@@ -259,10 +271,4 @@ pub fn peak_memory_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
     line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()).map_or(0, |kib| kib * 1024)
-}
-
-/// Forgets the peak so far, so that the next run of this process is measured by itself.
-pub fn reset_peak_memory() {
-    // Where this is not possible the peak of the process is reported, which is never too small.
-    let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

@@ -4,32 +4,60 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
+/// A picture read row by row, eight bits a channel.
+struct Rows {
+    reader: png::Reader<BufReader<File>>,
+    color: png::ColorType,
+    channels: usize,
+    width: usize,
+    height: usize,
+}
+
+impl Rows {
+    fn open(path: &Path) -> Option<Self> {
+        let mut decoder = png::Decoder::new(BufReader::new(File::open(path).ok()?));
+        decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
+        let reader = decoder.read_info().ok()?;
+        let (color, depth) = reader.output_color_type();
+        let (width, height) = (reader.info().width as usize, reader.info().height as usize);
+        (depth == png::BitDepth::Eight).then_some(Self { reader, color, channels: color.samples(), width, height })
+    }
+
+    fn next(&mut self) -> Option<&[u8]> {
+        // The row borrows from the reader.
+        match self.reader.next_row() {
+            Ok(Some(row)) => Some(row.data()),
+            _ => None,
+        }
+    }
+}
+
+/// Whether a pixel of 1 to 4 channels shows anything.
+fn opaque(pixel: &[u8]) -> bool {
+    match pixel {
+        [_, alpha] | [_, _, _, alpha] => *alpha > 0,
+        _ => true,
+    }
+}
+
 /// A picture thinned to at most `widest` columns, as PNG; `None` when there is no such picture that reads.
 pub(super) fn thumbnail(path: &Path, widest: usize) -> Option<Vec<u8>> {
-    let mut decoder = png::Decoder::new(BufReader::new(File::open(path).ok()?));
-    decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
-    let mut reader = decoder.read_info().ok()?;
-    let (color, depth) = reader.output_color_type();
-    if depth != png::BitDepth::Eight {
-        return None;
-    }
-    let channels = color.samples();
-    let (width, height) = (reader.info().width as usize, reader.info().height as usize);
-    let step = width.div_ceil(widest).max(1);
-    let (columns, rows) = (width.div_ceil(step), height.div_ceil(step));
-    let mut thin = Vec::with_capacity(columns * rows * channels);
-    // Means of opaque pixels of a step x step block; only the rows of one block are held.
+    let mut rows = Rows::open(path)?;
+    let (width, step) = (rows.width, rows.width.div_ceil(widest).max(1));
+    thin(&mut rows, 0, width, step)
+}
+
+/// Means of the opaque pixels of `step` x `step` blocks; only the rows of one block are held.
+fn thin(rows: &mut Rows, from: usize, to: usize, step: usize) -> Option<Vec<u8>> {
+    let (channels, height) = (rows.channels, rows.height);
+    let (columns, lines) = ((to - from).div_ceil(step), height.div_ceil(step));
+    let mut thin = Vec::with_capacity(columns * lines * channels);
     let mut sums = vec![[0u64; 4]; columns];
     let mut counts = vec![0u64; columns];
     for y in 0..height {
-        let row = reader.next_row().ok()??;
-        for (x, pixel) in row.data().chunks_exact(channels).enumerate() {
-            let alpha = match channels {
-                2 => pixel[1],
-                4 => pixel[3],
-                _ => 255,
-            };
-            if alpha > 0 {
+        let row = rows.next()?;
+        for (x, pixel) in row.chunks_exact(channels).take(to).skip(from).enumerate() {
+            if opaque(pixel) {
                 for (sum, &value) in sums[x / step].iter_mut().zip(pixel) {
                     *sum += u64::from(value);
                 }
@@ -44,11 +72,39 @@ pub(super) fn thumbnail(path: &Path, widest: usize) -> Option<Vec<u8>> {
         }
     }
     let mut out = Vec::new();
-    let mut encoder = png::Encoder::new(&mut out, columns as u32, rows as u32);
-    encoder.set_color(color);
+    let mut encoder = png::Encoder::new(&mut out, columns as u32, lines as u32);
+    encoder.set_color(rows.color);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.write_header().ok()?.write_image_data(&thin).ok()?;
     Some(out)
+}
+
+/// For each column of a picture: pixels of one colour, and pixels between the uppermost and the lowest opaque one. `None`
+/// when there is no such picture that reads.
+pub(super) fn column_counts(path: &Path, color: [u8; 3]) -> Option<Vec<[u32; 2]>> {
+    let mut rows = Rows::open(path)?;
+    let mut found = vec![(0u32, None::<(u32, u32)>); rows.width];
+    for y in 0..rows.height as u32 {
+        let channels = rows.channels;
+        for (pixel, (count, span)) in rows.next()?.chunks_exact(channels).zip(&mut found) {
+            if opaque(pixel) {
+                *count += u32::from(channels >= 3 && pixel[..3] == color);
+                *span = Some((span.map_or(y, |(top, _)| top), y));
+            }
+        }
+    }
+    Some(found.into_iter().map(|(count, span)| [count, span.map_or(0, |(top, bottom)| bottom - top + 1)]).collect())
+}
+
+/// A piece of a picture from column `from` to column `to`, thinned to at most `tallest` rows, as PNG.
+pub(super) fn upright_piece(path: &Path, from: usize, to: usize, tallest: usize) -> Option<Vec<u8>> {
+    let mut rows = Rows::open(path)?;
+    let (from, to) = (from.min(rows.width), to.min(rows.width));
+    if to <= from {
+        return None;
+    }
+    let step = rows.height.div_ceil(tallest).max(1);
+    thin(&mut rows, from, to, step)
 }
 
 /// Bytes as text for a `data:` address (RFC 4648).
@@ -75,6 +131,25 @@ mod tests {
             ["", "f", "fo", "foo", "foob"].map(|s| base64(s.as_bytes())),
             ["", "Zg==", "Zm8=", "Zm9v", "Zm9vYg=="]
         );
+    }
+
+    #[test]
+    fn columns_are_counted_and_cut_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 3, 3);
+        encoder.set_color(png::ColorType::Rgba);
+        let (seen, other, clear) = ([1, 2, 3, 255], [9, 9, 9, 255], [0, 0, 0, 0]);
+        let pixels = [seen, clear, clear, clear, seen, clear, other, other, clear].concat();
+        encoder.write_header().unwrap().write_image_data(&pixels).unwrap();
+        // The hole between two opaque pixels counts to the whole.
+        assert_eq!(column_counts(&path, [1, 2, 3]).unwrap(), [[1, 3], [1, 2], [0, 0]]);
+        let piece = upright_piece(&path, 1, 2, 100).unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(piece)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut pixels).unwrap();
+        assert_eq!(pixels, [clear, seen, other].concat());
+        assert!(upright_piece(&path, 5, 9, 100).is_none());
     }
 
     #[test]

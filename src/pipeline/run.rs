@@ -3,10 +3,14 @@
 use super::checkpoint::{self, Checkpoint};
 use super::error::Error;
 use super::explain::{self, Explanation};
+use super::judge::Previous;
 use super::limits::Status;
 use super::line::{self, Line, Observer, Plan, Stage, done, section};
+use super::picture;
+use super::preflight::Need;
+use super::profile::{self, Columns};
 use super::report;
-use super::run_folder::{RunFolder, sha256_of};
+use super::run_folder::{RunFolder, sha256_of, sha256_of_all};
 use super::settings::Pipeline;
 use crate::axis::{self, Axis, AxisCoordinates};
 use crate::cloud::ScanFrame;
@@ -21,9 +25,11 @@ use crate::warning::Warning;
 use crate::{clean, cut, io, map};
 use rayon::prelude::*;
 use serde_json::json;
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 /// The stages in their order. Raise a version when the stage gives other results for the same input.
 pub const STAGES: &[Stage] = &[
@@ -37,6 +43,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 2, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
+    Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
 ];
 
 /// The stages of a run that starts from a mesh.
@@ -47,14 +54,11 @@ pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
+    Stage { name: "profile", version: 1, needs: &["map", "unwrap", "mesh", "axis"] },
 ];
 
 /// Distance between the lines of `axis.csv`, metres.
 const AXIS_CSV_STEP_M: f64 = 0.5;
-
-/// Sections told in the report, and points of each.
-const PROFILES: usize = 6;
-const PROFILE_POINTS: usize = 120;
 
 /// How a run ended.
 #[derive(Clone, Debug)]
@@ -73,6 +77,21 @@ struct Surface {
     section: SectionField,
     /// Where the walls meet the floor; empty without a floor.
     feet: Vec<map::Feet>,
+}
+
+/// What a run is allowed and asked to do besides what its pipeline says. None of it changes a product.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// What to do again although it is there.
+    pub redo: Redo,
+    /// Memory that the run may need, bytes; without it, what the system has free.
+    pub memory_bytes: Option<u64>,
+    /// Folder on a fast disk for checkpoints and products that are being written; without it, the run folder.
+    pub tmp: Option<PathBuf>,
+    /// Run folder of the last accepted run of the same tunnel, for the limits of drift.
+    pub compare_with: Option<PathBuf>,
+    /// Hash that the input must have ([`super::run_folder::sha256_of_all`]), where it was taken for what it was before.
+    pub expect_sha256: Option<String>,
 }
 
 /// What to do again although it is there.
@@ -117,13 +136,37 @@ struct Prepared {
     from_mesh: bool,
     stages: &'static [Stage],
     input_hashes: Vec<String>,
+    stamps: Stamps,
     plans: Vec<Plan>,
+}
+
+/// Length and time of the inputs from before they were hashed: tells whether somebody writes to them meanwhile.
+struct Stamps(Vec<(PathBuf, Option<(u64, SystemTime)>)>);
+
+impl Stamps {
+    fn of(files: &[PathBuf]) -> Self {
+        Self(files.iter().map(|f| (f.clone(), stamp(f))).collect())
+    }
+
+    /// Refuses files that are not what they were.
+    fn check(&self) -> Result<(), Error> {
+        match self.0.iter().find(|(file, before)| stamp(file) != *before) {
+            Some((path, _)) => Err(Error::InputChanged { path: path.clone() }),
+            None => Ok(()),
+        }
+    }
+}
+
+fn stamp(file: &Path) -> Option<(u64, SystemTime)> {
+    let found = std::fs::metadata(file).ok()?;
+    Some((found.len(), found.modified().ok()?))
 }
 
 fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
     if pipeline.input.is_empty() {
         return Err(Error::NoInput);
     }
+    let stamps = Stamps::of(&pipeline.input);
     let input_hashes = hash_inputs(&pipeline.input)?;
     let alignment_hash = hash_inputs(pipeline.axis.alignment.as_slice())?;
     let poses_hash = hash_inputs(pipeline.ingest.poses.as_slice())?;
@@ -146,31 +189,69 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
             _ => BTreeMap::new(),
         },
     );
-    Ok(Prepared { from_mesh, stages, input_hashes, plans })
+    Ok(Prepared { from_mesh, stages, input_hashes, stamps, plans })
 }
 
 /// Runs the pipeline in a run folder, doing only what is not there yet.
 ///
 /// # Errors
 /// [`Error`] with the stage that refused. The folder then holds the products of the stages before it.
-pub fn run(pipeline: &Pipeline, out: &Path, redo: &Redo, observer: &dyn Observer) -> Result<Outcome, Error> {
-    let Prepared { from_mesh, stages, input_hashes, plans } = prepare(pipeline)?;
-    redo.check(stages)?;
-    let folder = RunFolder::open(out)?;
+pub fn run(pipeline: &Pipeline, out: &Path, options: &Options, observer: &dyn Observer) -> Result<Outcome, Error> {
+    let prepared = prepare(pipeline)?;
+    options.redo.check(prepared.stages)?;
+    if options.expect_sha256.as_ref().is_some_and(|expected| *expected != sha256_of_all(&prepared.input_hashes)) {
+        return Err(Error::InputChanged { path: pipeline.input[0].clone() });
+    }
+    let folder = RunFolder::open_with_scratch(out, options.tmp.as_deref())?;
     folder.refuse_inputs_inside(&pipeline.input, &["points.laz", "points.ply", "mesh.ply", "chart.ply"])?;
-    for stage in stages.iter().filter(|s| redo.includes(s.name, stages)) {
+    if let Some(stage) = folder.interrupted() {
+        observer.resumed(stage);
+    }
+    let result = run_in(&folder, pipeline, prepared, options, observer);
+    if let Err(error) = &result {
+        // The error itself is what counts; a full disk may be the reason for both.
+        let _ = folder.note("run-failed", json!({ "error": error.to_string() }));
+    }
+    result
+}
+
+fn run_in(
+    folder: &RunFolder,
+    pipeline: &Pipeline,
+    prepared: Prepared,
+    options: &Options,
+    observer: &dyn Observer,
+) -> Result<Outcome, Error> {
+    let Prepared { from_mesh, stages, input_hashes, stamps, plans } = prepared;
+    for stage in stages.iter().filter(|s| options.redo.includes(s.name, stages)) {
         folder.forget(stage.name)?;
     }
-    let line = Line::new(&folder, observer, plans);
+    let line = Line::new(folder, observer, plans);
     for stage in stages.iter().filter(|s| line.is_fresh(s.name)) {
         observer.finished(stage.name, 0.0, true);
     }
-    if from_mesh {
-        run_mesh(pipeline, &line)?;
-    } else {
-        run_scan(pipeline, &line, Until::End)?;
+    if stages.iter().any(|s| !line.is_fresh(s.name)) {
+        match Need::of(&pipeline.input, pipeline) {
+            Ok(need) => need.check(options.memory_bytes, folder.path())?,
+            Err(error) if pipeline.ingest.allow_truncated => {
+                let message = format!("memory and disk are not estimated, because {error}");
+                observer.warned("ingest", &Warning::new("no-estimate", message));
+            }
+            Err(error) => return Err(Error::in_stage("ingest")(error)),
+        }
+        folder.note("run-begun", json!({ "adit_version": env!("CARGO_PKG_VERSION"), "input": pipeline.input }))?;
     }
-    report::finish(pipeline, &line, &folder, &input_hashes)
+    if from_mesh {
+        run_mesh(pipeline, &stamps, &line)?;
+    } else {
+        run_scan(pipeline, &stamps, &line, Until::End)?;
+    }
+    let previous = options.compare_with.as_deref().map(Previous::read);
+    let outcome = report::finish(pipeline, &line, folder, &input_hashes, previous)?;
+    if outcome.worked {
+        folder.note("run-finished", json!({ "status": outcome.status }))?;
+    }
+    Ok(outcome)
 }
 
 /// Runs the pipeline of a scan in a run folder as far as the surface: afterwards the folder holds `mesh.ply` and
@@ -179,10 +260,10 @@ pub fn run(pipeline: &Pipeline, out: &Path, redo: &Redo, observer: &dyn Observer
 /// # Errors
 /// As [`run`].
 pub fn run_to_surface(pipeline: &Pipeline, out: &Path, observer: &dyn Observer) -> Result<(), Error> {
-    let plans = prepare(pipeline)?.plans;
+    let Prepared { plans, stamps, .. } = prepare(pipeline)?;
     let folder = RunFolder::open(out)?;
     folder.refuse_inputs_inside(&pipeline.input, &["mesh.ply"])?;
-    run_scan(pipeline, &Line::new(&folder, observer, plans), Until::Surface)
+    run_scan(pipeline, &stamps, &Line::new(&folder, observer, plans), Until::Surface)
 }
 
 /// How far a run goes.
@@ -193,8 +274,13 @@ enum Until {
 }
 
 /// From a scan to everything.
-fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Result<(), Error> {
-    let cloud = line.passing("ingest", |_| done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest)));
+fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, until: Until) -> Result<(), Error> {
+    let coordinates = OnceCell::new();
+    let cloud = line.passing("ingest", |_| {
+        let read = done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest))?;
+        stamps.check()?;
+        Ok(read)
+    });
     let cleaned = line.passing("clean", |_| done("clean", clean::clean(&*cloud.get()?, &pipeline.clean)));
     let axis = line.product("axis", |staging| {
         let frame = cloud.get()?.frame().clone();
@@ -210,8 +296,7 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
         let segmentation = segmentation.get()?;
         cleaned.release();
         let axis = axis.get()?;
-        let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
-        summary["profiles"] = profiles(&segmentation.section);
+        let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
         let feet = feet(&segmentation);
         Ok((Surface { mesh, section: segmentation.section.clone(), feet }, summary))
@@ -249,7 +334,8 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
     let map = line.passing("map", |staging| {
         let (cloud, chart, axis, surface) = (cloud.get()?, chart.get()?, axis.get()?, surface.get()?);
         let placed = placed.get()?;
-        let around = around_the_axis(pipeline, &chart, &axis, &surface)?;
+        let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
+        let around = around_the_axis(pipeline, &chart, places, &axis, &surface)?;
         let input = map::DrawInput {
             chart: &chart,
             points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
@@ -271,17 +357,35 @@ fn run_scan<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>, until: Until) -> Res
         let written = io::write_points(&cloud, &columns, &staging.join(points_file(&pipeline.input)));
         done("points", written.map(|summary| ((), summary)))
     });
+    let profile = line.passing("profile", |_| {
+        map.ensure()?;
+        let (chart, axis, surface, placed) = (chart.get()?, axis.get()?, surface.get()?, placed.get()?);
+        Ok(told_along(
+            pipeline,
+            line,
+            &chart,
+            vertex_coordinates(&coordinates, chart.strip().mesh(), &axis),
+            &surface,
+            Some(&placed),
+        ))
+    });
     axis.ensure()?;
     surface.ensure()?;
     chart.ensure()?;
     placed.ensure()?;
     points.ensure()?;
-    map.ensure()
+    map.ensure()?;
+    profile.ensure()
 }
 
 /// From a mesh to a map of its surface; it enters at `cut`, its vertices stand for the points where some are needed.
-fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error> {
-    let raw = line.passing("ingest", |_| done("ingest", io::read_mesh(&pipeline.input[0])));
+fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) -> Result<(), Error> {
+    let coordinates = OnceCell::new();
+    let raw = line.passing("ingest", |_| {
+        let read = done("ingest", io::read_mesh(&pipeline.input[0]))?;
+        stamps.check()?;
+        Ok(read)
+    });
     let axis = line.product("axis", |staging| {
         let raw = raw.get()?;
         let result = find_axis(pipeline, &raw.vertices, &raw.frame)?;
@@ -303,7 +407,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
             .sum();
         let summary = json!({
             "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
-            "profiles": profiles(&section), "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
+            "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
         });
         Ok((Surface { mesh, section, feet: vec![] }, summary))
     });
@@ -318,8 +422,9 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
         Ok((chart, summary))
     });
     let map = line.passing("map", |staging| {
-        let (chart, surface) = (chart.get()?, surface.get()?);
-        let around = around_the_axis(pipeline, &chart, &*axis.get()?, &surface)?;
+        let (chart, surface, axis) = (chart.get()?, surface.get()?, axis.get()?);
+        let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
+        let around = around_the_axis(pipeline, &chart, places, &axis, &surface)?;
         let frame = raw.get()?.frame.clone();
         let input = map::DrawInput {
             chart: &chart,
@@ -330,10 +435,23 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, line: &'a Line<'a>) -> Result<(), Error>
         };
         draw_map(pipeline, &input, &around.lines, staging)
     });
+    let profile = line.passing("profile", |_| {
+        map.ensure()?;
+        let (chart, axis, surface) = (chart.get()?, axis.get()?, surface.get()?);
+        Ok(told_along(
+            pipeline,
+            line,
+            &chart,
+            vertex_coordinates(&coordinates, chart.strip().mesh(), &axis),
+            &surface,
+            None,
+        ))
+    });
     axis.ensure()?;
     surface.ensure()?;
     chart.ensure()?;
-    map.ensure()
+    map.ensure()?;
+    profile.ensure()
 }
 
 /// Traces the axis, or reads the alignment that the settings name.
@@ -480,16 +598,37 @@ fn points_file(inputs: &[PathBuf]) -> &'static str {
     if inputs.iter().all(is_ply) { "points.ply" } else { "points.laz" }
 }
 
-/// Mean sections at evenly spread chainages, for the report.
-fn profiles(section: &SectionField) -> serde_json::Value {
-    let millimetres = |v: f64| (v * 1000.0).round() / 1000.0;
-    let at = |i: usize| {
-        let chainage = section.start() + (i as f64 + 0.5) / PROFILES as f64 * (section.end() - section.start());
-        let angle = |k: usize| std::f64::consts::TAU * k as f64 / PROFILE_POINTS as f64 - std::f64::consts::PI;
-        let radii: Vec<f64> = (0..PROFILE_POINTS).map(|k| millimetres(section.radius(chainage, angle(k)))).collect();
-        json!({ "chainage_m": millimetres(chainage), "radii_m": radii })
+/// What the map is like along the tunnel, from the finished products.
+fn told_along(
+    pipeline: &Pipeline,
+    line: &Line,
+    chart: &Chart,
+    coordinates: &[AxisCoordinates],
+    surface: &Surface,
+    placed: Option<&PlacedPoints>,
+) -> ((), serde_json::Value) {
+    let input = profile::Input {
+        chart,
+        coordinates,
+        section: &surface.section,
+        points: placed.map(|p| (p.uv.as_slice(), p.offsets_m.as_slice())),
+        coverage: coverage_columns(&line.folder().path().join("map/coverage.png")),
     };
-    (0..PROFILES).map(at).collect()
+    ((), section(&profile::profile(&input, &pipeline.profile)))
+}
+
+/// Counts of the columns of the coverage picture; `None` when the map has none.
+fn coverage_columns(path: &Path) -> Option<Columns> {
+    let world = std::fs::read_to_string(path.with_extension("pgw")).ok()?;
+    let numbers: Vec<f64> = world.lines().map(|l| l.trim().parse().ok()).collect::<Option<_>>()?;
+    let (width_m, first_m) = (*numbers.first()?, *numbers.get(4)?);
+    let counts = picture::column_counts(path, map::OBSERVED_COLOR)?;
+    Some(Columns { start_m: first_m - width_m / 2.0, width_m, counts })
+}
+
+/// Axis coordinates of the vertices, computed once for all who need them.
+fn vertex_coordinates<'c>(once: &'c OnceCell<Vec<AxisCoordinates>>, mesh: &Mesh, axis: &Axis) -> &'c [AxisCoordinates] {
+    once.get_or_init(|| mesh.vertices().par_iter().map(|p| axis.project(p)).collect())
 }
 
 /// What the map shows of the place of the surface around the axis.
@@ -502,9 +641,13 @@ struct AroundTheAxis {
     lines: Vec<map::ReferenceLine>,
 }
 
-fn around_the_axis(pipeline: &Pipeline, chart: &Chart, axis: &Axis, surface: &Surface) -> Result<AroundTheAxis, Error> {
-    let coordinates: Vec<AxisCoordinates> =
-        chart.strip().mesh().vertices().par_iter().map(|p| axis.project(p)).collect();
+fn around_the_axis(
+    pipeline: &Pipeline,
+    chart: &Chart,
+    coordinates: &[AxisCoordinates],
+    axis: &Axis,
+    surface: &Surface,
+) -> Result<AroundTheAxis, Error> {
     let offset = |c: &AxisCoordinates| surface.section.radius(c.chainage, c.angle()) - c.radius();
     let design_offsets_m = match &pipeline.map.design_profile {
         None => None,
@@ -518,7 +661,7 @@ fn around_the_axis(pipeline: &Pipeline, chart: &Chart, axis: &Axis, surface: &Su
     let lines = if axis.is_shaft() {
         vec![]
     } else {
-        map::reference_lines(chart, &coordinates, &surface.section, &surface.feet)
+        map::reference_lines(chart, coordinates, &surface.section, &surface.feet)
     };
     Ok(AroundTheAxis { section_offsets_m: coordinates.par_iter().map(offset).collect(), design_offsets_m, lines })
 }

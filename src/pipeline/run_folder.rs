@@ -3,6 +3,8 @@
 //! Nothing appears under its final name before it is complete and on disk: a stage writes into `.adit/tmp-<stage>/`,
 //! then every file is synced and renamed into place, and only then the stage's record is written. Killed at any moment,
 //! the folder holds whole files and records that tell the truth; what is missing is made again, with the same bytes.
+//! With a scratch folder (`--tmp`) stages prepare their products and keep their checkpoints there; products still come into
+//! the run folder by a rename. `.adit/journal.jsonl` tells what was begun and finished, and when.
 
 use super::error::Kind;
 use serde::{Deserialize, Serialize};
@@ -68,7 +70,7 @@ impl Error {
 }
 
 /// A product of a stage.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ProductFile {
     /// Path in the run folder, with `/`.
     pub name: String,
@@ -103,9 +105,16 @@ pub struct Record {
 #[derive(Debug)]
 pub struct RunFolder {
     path: PathBuf,
+    /// Where stages prepare products and keep checkpoints: `.adit`, or a folder below `--tmp`.
+    scratch: PathBuf,
+    interrupted: Option<String>,
     // Held until dropped; the operating system frees it when the process dies, so no lock can be stale.
     _lock: File,
 }
+
+/// Names the scratch folder of a run folder that has one elsewhere, so that it is removed with it.
+const SCRATCH_NOTE: &str = "scratch";
+const JOURNAL: &str = "journal.jsonl";
 
 impl RunFolder {
     /// Makes the folder if needed, takes its lock and removes what an interrupted run left unfinished.
@@ -113,6 +122,14 @@ impl RunFolder {
     /// # Errors
     /// [`Error::Io`], or [`Error::Locked`] with the process that holds it.
     pub fn open(path: &Path) -> Result<Self, Error> {
+        Self::open_with_scratch(path, None)
+    }
+
+    /// [`Self::open`], with a folder on a fast disk for what is not a product.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_with_scratch(path: &Path, tmp: Option<&Path>) -> Result<Self, Error> {
         let private = path.join(PRIVATE);
         fs::create_dir_all(&private).map_err(Error::io("make the run folder", path))?;
         let lock_path = private.join("lock");
@@ -137,16 +154,50 @@ impl RunFolder {
         lock.set_len(0)
             .and_then(|()| write!(lock, "process {} on {}", std::process::id(), host.trim()))
             .map_err(Error::io("write the lock", &lock_path))?;
-        for entry in fs::read_dir(&private).map_err(Error::io("list", &private))?.flatten() {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            if name.starts_with("tmp-") {
-                let leftover = entry.path();
-                let removed =
-                    if leftover.is_dir() { fs::remove_dir_all(&leftover) } else { fs::remove_file(&leftover) };
-                removed.map_err(Error::io("remove the leftover", &leftover))?;
+        let scratch = match tmp {
+            None => private.clone(),
+            Some(tmp) => {
+                let absolute = fs::canonicalize(path).map_err(Error::io("find", path))?;
+                let name = sha256_of_bytes(absolute.to_string_lossy().as_bytes());
+                let scratch = tmp.join(format!("adit-{}", &name[..16]));
+                fs::create_dir_all(&scratch).map_err(Error::io("make the scratch folder", &scratch))?;
+                scratch
             }
+        };
+        remove_leftovers(&private)?;
+        if scratch != private {
+            remove_leftovers(&scratch)?;
         }
-        Ok(Self { path: path.to_owned(), _lock: lock })
+        let folder = Self { path: path.to_owned(), interrupted: interrupted_in(&private), scratch, _lock: lock };
+        if tmp.is_some() {
+            folder.write(&format!("{PRIVATE}/{SCRATCH_NOTE}"), folder.scratch.to_string_lossy().as_bytes())?;
+        }
+        Ok(folder)
+    }
+
+    /// The stage during which the last process that worked here died, if it did.
+    pub fn interrupted(&self) -> Option<&str> {
+        self.interrupted.as_deref()
+    }
+
+    /// Appends a line to the journal and waits until it is on disk.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn note(&self, event: &str, fields: serde_json::Value) -> Result<(), Error> {
+        let path = self.path.join(PRIVATE).join(JOURNAL);
+        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+        let mut line = serde_json::json!({
+            "time_unix_s": now.as_millis() as f64 / 1000.0, "process": std::process::id(), "event": event,
+        });
+        if let (Some(line), serde_json::Value::Object(fields)) = (line.as_object_mut(), fields) {
+            line.extend(fields);
+        }
+        let mut file = File::options().create(true).append(true).open(&path).map_err(Error::io("open", &path))?;
+        // One write a line, beginning on a new line even after a torn one.
+        file.write_all(format!("\n{line}").as_bytes())
+            .and_then(|()| file.sync_data())
+            .map_err(Error::io("write", &path))
     }
 
     /// The folder.
@@ -174,12 +225,20 @@ impl RunFolder {
     /// # Errors
     /// [`Error::Io`].
     pub fn staging(&self, stage: &str) -> Result<PathBuf, Error> {
-        let path = self.path.join(PRIVATE).join(format!("tmp-{stage}"));
+        let path = self.scratch.join(format!("tmp-{stage}"));
         if path.exists() {
             fs::remove_dir_all(&path).map_err(Error::io("empty", &path))?;
         }
         fs::create_dir_all(&path).map_err(Error::io("make", &path))?;
         Ok(path)
+    }
+
+    /// Removes a staging folder whose products are not needed.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn discard(&self, staging: &Path) -> Result<(), Error> {
+        fs::remove_dir_all(staging).map_err(Error::io("remove", staging))
     }
 
     /// Syncs every file of the staging folder and renames it to the same name in the run folder.
@@ -203,12 +262,23 @@ impl RunFolder {
             if let Some(folder) = place.parent() {
                 fs::create_dir_all(folder).map_err(Error::io("make", folder))?;
             }
-            fs::rename(staging.join(name), &place).map_err(Error::io("write", &place))?;
+            self.bring(&staging.join(name), &place)?;
         }
         sync_folder(&self.path);
         sync_folder(&self.path.join("map"));
         fs::remove_dir_all(staging).map_err(Error::io("remove", staging))?;
         Ok(files)
+    }
+
+    /// Renames a synced file into place; from a scratch folder on another disk it is copied beside its place before.
+    fn bring(&self, staged: &Path, place: &Path) -> Result<(), Error> {
+        if self.scratch == self.path.join(PRIVATE) {
+            return fs::rename(staged, place).map_err(Error::io("write", place));
+        }
+        let beside = self.path.join(PRIVATE).join("tmp-copy");
+        fs::copy(staged, &beside).map_err(Error::io("write", &beside))?;
+        File::open(&beside).and_then(|f| f.sync_all()).map_err(Error::io("sync", &beside))?;
+        fs::rename(&beside, place).map_err(Error::io("write", place))
     }
 
     /// Writes one file under a temporary name, syncs and renames it.
@@ -225,7 +295,7 @@ impl RunFolder {
 
     /// Where the checkpoint of a stage is.
     pub fn checkpoint(&self, stage: &str) -> PathBuf {
-        self.path.join(PRIVATE).join(format!("{stage}.columns"))
+        self.scratch.join(format!("{stage}.columns"))
     }
 
     /// The record of a stage; `None` when it has none that reads.
@@ -274,6 +344,54 @@ impl RunFolder {
     }
 }
 
+/// Removes what an interrupted run left under temporary names.
+fn remove_leftovers(folder: &Path) -> Result<(), Error> {
+    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))?.flatten() {
+        if entry.file_name().to_string_lossy().starts_with("tmp-") {
+            let leftover = entry.path();
+            let removed = if leftover.is_dir() { fs::remove_dir_all(&leftover) } else { fs::remove_file(&leftover) };
+            removed.map_err(Error::io("remove the leftover", &leftover))?;
+        }
+    }
+    Ok(())
+}
+
+/// The stage that the journal begins but neither finishes nor fails, in its last run. Torn lines count as not written.
+fn interrupted_in(private: &Path) -> Option<String> {
+    let text = fs::read_to_string(private.join(JOURNAL)).ok()?;
+    // Stages ask for each other, so several can be begun at a time.
+    let mut begun: Vec<String> = Vec::new();
+    for line in text.lines().filter_map(|l| serde_json::from_str::<serde_json::Value>(l).ok()) {
+        let stage = line.get("stage").and_then(|s| s.as_str()).unwrap_or("");
+        match line.get("event").and_then(|e| e.as_str()) {
+            Some("run-begun") => begun = vec!["ingest".to_owned()],
+            Some("stage-begun") => begun.push(stage.to_owned()),
+            Some("stage-finished") => begun.retain(|s| s != stage),
+            Some("run-finished" | "run-failed") => begun.clear(),
+            _ => {}
+        }
+    }
+    begun.pop()
+}
+
+/// Removes a run folder that nobody works in, with its scratch folder.
+///
+/// # Errors
+/// [`Error::Locked`] while somebody does, [`Error::Io`].
+pub fn remove(path: &Path) -> Result<(), Error> {
+    drop(RunFolder::open(path)?);
+    let scratch = fs::read_to_string(path.join(PRIVATE).join(SCRATCH_NOTE)).map(PathBuf::from);
+    // A note that was damaged must not remove anything else.
+    let named = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("adit-"));
+    if let Ok(scratch) = scratch
+        && named(&scratch)
+        && scratch.is_dir()
+    {
+        fs::remove_dir_all(&scratch).map_err(Error::io("remove", &scratch))?;
+    }
+    fs::remove_dir_all(path).map_err(Error::io("remove", path))
+}
+
 /// The record of a stage in a run folder; `None` when it has none that reads.
 pub fn read_record(folder: &Path, stage: &str) -> Option<Record> {
     let text = fs::read(folder.join(PRIVATE).join(format!("{stage}.json"))).ok()?;
@@ -294,6 +412,14 @@ pub fn sha256_of(path: &Path) -> Result<String, Error> {
             return Ok(hexadecimal(&hash.finalize()));
         }
         hash.update(&buffer[..read]);
+    }
+}
+
+/// One hash for several files in their order: that of the only file, or the hash over all hashes.
+pub fn sha256_of_all(hashes: &[String]) -> String {
+    match hashes {
+        [one] => one.clone(),
+        _ => sha256_of_bytes(hashes.concat().as_bytes()),
     }
 }
 
@@ -373,6 +499,39 @@ mod tests {
         drop(folder);
         RunFolder::open(place.path()).unwrap();
         assert!(!half.exists() && !place.path().join("points.laz").exists());
+    }
+
+    #[test]
+    fn the_journal_tells_where_a_run_was_interrupted() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = RunFolder::open(place.path()).unwrap();
+        folder.note("run-begun", serde_json::json!({})).unwrap();
+        folder.note("stage-begun", serde_json::json!({ "stage": "mesh" })).unwrap();
+        // A torn line.
+        let path = place.path().join(".adit/journal.jsonl");
+        fs::write(&path, fs::read_to_string(&path).unwrap() + "\n{\"event\": \"run-fin").unwrap();
+        drop(folder);
+        let folder = RunFolder::open(place.path()).unwrap();
+        assert_eq!(folder.interrupted(), Some("mesh"));
+        folder.note("run-finished", serde_json::json!({})).unwrap();
+        drop(folder);
+        assert_eq!(RunFolder::open(place.path()).unwrap().interrupted(), None);
+    }
+
+    #[test]
+    fn a_scratch_folder_elsewhere_holds_what_is_no_product() {
+        let (place, tmp) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let run = place.path().join("run");
+        let folder = RunFolder::open_with_scratch(&run, Some(tmp.path())).unwrap();
+        let staging = folder.staging("mesh").unwrap();
+        assert!(staging.starts_with(tmp.path()) && folder.checkpoint("mesh").starts_with(tmp.path()));
+        fs::write(staging.join("mesh.ply"), b"ply").unwrap();
+        fs::write(folder.checkpoint("mesh"), b"columns").unwrap();
+        folder.publish(&staging).unwrap();
+        assert_eq!(fs::read(run.join("mesh.ply")).unwrap(), b"ply");
+        drop(folder);
+        remove(&run).unwrap();
+        assert!(!run.exists() && fs::read_dir(tmp.path()).unwrap().next().is_none());
     }
 
     #[test]

@@ -1,23 +1,22 @@
 //! A folder of runs: one run folder a scan, a ledger, the pointer to the last accepted run, a page and metrics over all.
 //!
-//! A scan gets the folder `<name>-<start of its hash>`, so another scan of the same name never overwrites a map.
+//! A scan gets the folder `<name>-<start of its hash>`, so another scan of the same name never overwrites a map. An accepted
+//! run is never changed either: other settings for the same scan get a folder of their own.
 
-use super::error::{Error, Kind};
-use super::limits::{Status, number};
-use super::line::{Observer, peak_memory_bytes, reset_peak_memory};
-use super::page::escape;
-use super::run::{Outcome, Redo, run};
-use super::run_folder::{self, sha256_of, sha256_of_bytes, write_atomically};
+use super::arrivals::Scan;
+use super::error::Kind;
+use super::explain;
+use super::limits::Status;
+use super::run::explain as explain_run;
+use super::run_folder::{self, read_record, sha256_of, sha256_of_all, sha256_of_bytes, write_atomically};
+use super::series_page;
 use super::settings::Pipeline;
 use serde::{Deserialize, Serialize};
-use std::fmt::Write;
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
-
-/// Files that count as scans or meshes when a folder is looked through.
-const EXTENSIONS: [&str; 14] =
-    ["las", "laz", "e57", "ply", "ptx", "pts", "xyz", "csv", "txt", "pcd", "obj", "off", "stl", "glb"];
 
 /// How the run of a scan ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -61,22 +60,37 @@ impl Verdict {
         }
     }
 
-    fn of(result: &Result<Outcome, Error>) -> Self {
-        match result {
-            Ok(outcome) => match outcome.status {
-                Status::Pass => Self::Pass,
-                Status::Warn => Self::Warn,
-                Status::Fail => Self::Fail,
-            },
-            Err(error) => match error.kind() {
-                Kind::Usage => Self::Usage,
-                Kind::BadInput => Self::BadInput,
-                Kind::Unsupported => Self::Unsupported,
-                Kind::Resources => Self::Resources,
-                Kind::Internal => Self::Internal,
-            },
+    /// The verdict of a run that did not finish.
+    pub fn of_kind(kind: Kind) -> Self {
+        match kind {
+            Kind::Usage => Self::Usage,
+            Kind::BadInput => Self::BadInput,
+            Kind::Unsupported => Self::Unsupported,
+            Kind::Resources => Self::Resources,
+            Kind::Internal => Self::Internal,
         }
     }
+
+    /// The verdict of a run that finished.
+    pub fn of_status(status: Status) -> Self {
+        match status {
+            Status::Pass | Status::Skipped => Self::Pass,
+            Status::Warn => Self::Warn,
+            Status::Fail => Self::Fail,
+        }
+    }
+
+    /// All of them, the best first.
+    pub const ALL: [Self; 8] = [
+        Self::Pass,
+        Self::Warn,
+        Self::Fail,
+        Self::BadInput,
+        Self::Unsupported,
+        Self::Resources,
+        Self::Usage,
+        Self::Internal,
+    ];
 }
 
 /// One line of the ledger.
@@ -84,6 +98,9 @@ impl Verdict {
 pub struct Entry {
     /// Name of the scan.
     pub scan: String,
+    /// The tunnel that it is of; runs of one tunnel are compared.
+    #[serde(default)]
+    pub tunnel: String,
     /// Its files.
     pub files: Vec<PathBuf>,
     /// Sizes and modification times of the files when they were taken: tells a replaced scan without reading it.
@@ -100,89 +117,61 @@ pub struct Entry {
     pub finished_unix_s: u64,
     /// How long it took, seconds.
     pub seconds: f64,
+    /// Run folder of the run that it was compared with.
+    #[serde(default)]
+    pub compared_with: Option<String>,
     /// Points read.
     pub points: Option<f64>,
     /// Observed share of the map, percent.
     pub coverage_percent: Option<f64>,
     /// Mean stretch.
     pub stretch_mean: Option<f64>,
+    /// Scatter of the points about the surface, metres.
+    #[serde(default)]
+    pub noise_m: Option<f64>,
     /// Peak memory, bytes.
     pub peak_memory_bytes: u64,
 }
 
-/// A scan that waits to be mapped: a file, or a folder of stations.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Scan {
-    /// Name without extension.
-    pub name: String,
-    /// The files, sorted.
-    pub files: Vec<PathBuf>,
+/// A scan that is to be mapped, and where.
+#[derive(Clone, Debug)]
+pub struct Job {
+    /// The scan.
+    pub scan: Scan,
+    /// Name of its run folder.
+    pub run: String,
+    /// Run folder of the last accepted run of the same tunnel.
+    pub compared_with: Option<String>,
+    /// Hash of the scan when it was taken.
+    pub sha256: String,
+    stamp: String,
+    begun: Instant,
 }
 
-impl Scan {
-    /// The scan of a path: the file itself, or all scan files of a folder. `None` when there is none.
-    pub fn at(path: &Path) -> Option<Self> {
-        let name = path.file_stem()?.to_string_lossy().into_owned();
-        if path.is_dir() {
-            let mut files: Vec<PathBuf> =
-                fs::read_dir(path).ok()?.flatten().map(|e| e.path()).filter(|p| p.is_file() && is_scan(p)).collect();
-            files.sort();
-            let name = path.file_name()?.to_string_lossy().into_owned();
-            return (!files.is_empty()).then_some(Self { name, files });
-        }
-        is_scan(path).then(|| Self { name, files: vec![path.to_owned()] })
-    }
-
-    /// All scans directly in a folder, by name.
-    pub fn in_folder(folder: &Path) -> std::io::Result<Vec<Self>> {
-        let mut scans: Vec<Self> = fs::read_dir(folder)?.flatten().filter_map(|e| Self::at(&e.path())).collect();
-        scans.sort();
-        Ok(scans)
-    }
-
-    /// Sizes and modification times of the files; `None` while one cannot be looked at.
-    pub fn stamp(&self) -> Option<String> {
-        let mut stamp = String::new();
-        for file in &self.files {
-            let found = fs::metadata(file).ok()?;
-            let modified = found.modified().ok()?.duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
-            let _ = write!(stamp, "{}:{}:{modified};", file.display(), found.len());
-        }
-        Some(stamp)
-    }
-
-    /// Whether all files have been left alone for `quiet`, or a marker `<file>.done` (or `.done` in the folder) says
-    /// that the scan is complete.
-    pub fn is_settled(&self, quiet: Duration) -> bool {
-        self.is_marked() || self.files.iter().all(|f| age(f).is_some_and(|a| a >= quiet))
-    }
-
-    /// Whether a marker says that the scan is complete.
-    pub fn is_marked(&self) -> bool {
-        let beside = |f: &PathBuf| f.with_file_name(format!("{}.done", f.file_name().unwrap_or_default().display()));
-        let folder = self.files.first().and_then(|f| f.parent()).map(|p| p.join(".done"));
-        self.files.iter().all(|f| beside(f).exists()) || (self.files.len() > 1 && folder.is_some_and(|f| f.exists()))
-    }
-}
-
-fn is_scan(path: &Path) -> bool {
-    let hidden = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
-    let known = path.extension().is_some_and(|e| EXTENSIONS.iter().any(|k| e.eq_ignore_ascii_case(k)));
-    known && !hidden
-}
-
-/// How long ago a file was changed; a time in the future (clocks differ or jumped) counts as just now.
-fn age(path: &Path) -> Option<Duration> {
-    let modified = fs::metadata(path).ok()?.modified().ok()?;
-    Some(SystemTime::now().duration_since(modified).unwrap_or_default())
+/// How a run ended, for the ledger.
+#[derive(Clone, Debug)]
+pub struct Ended {
+    /// The verdict.
+    pub verdict: Verdict,
+    /// Why there is no map, if there is none.
+    pub error: Option<String>,
+    /// Greatest memory, bytes, as far as it is known.
+    pub peak_memory_bytes: u64,
 }
 
 /// A folder of runs, held by this process.
 pub struct Series {
     runs: PathBuf,
     entries: Vec<Entry>,
+    /// Scans that were refused for lack of memory or disk by this process, and when.
+    refused: BTreeMap<String, Instant>,
     _lock: File,
 }
+
+/// The pipeline of the scans that are being mapped.
+const PIPELINE: &str = ".pipeline.toml";
+/// Lack of memory or disk may pass: a refused scan is tried again after this time, and by the next process.
+const RETRY_AFTER: Duration = Duration::from_secs(900);
 
 impl Series {
     /// Opens the folder and takes its lock, so that no scan is taken twice.
@@ -208,7 +197,9 @@ impl Series {
             let holder = if holder.is_empty() { "another process".to_owned() } else { holder };
             return Err(run_folder::Error::Locked { path: runs.to_owned(), holder });
         }
-        fs::write(&lock_path, format!("process {}", std::process::id())).map_err(io("write the lock", &lock_path))?;
+        let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+        let holder = format!("process {} on {}", std::process::id(), host.trim());
+        fs::write(&lock_path, holder).map_err(io("write the lock", &lock_path))?;
         let ledger = runs.join("runs.json");
         let entries = match fs::read(&ledger) {
             Ok(text) => serde_json::from_slice(&text)
@@ -216,7 +207,12 @@ impl Series {
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Vec::new(),
             Err(e) => return Err(io("read", &ledger)(e)),
         };
-        Ok(Self { runs: runs.to_owned(), entries, _lock: lock })
+        Ok(Self { runs: runs.to_owned(), entries, refused: BTreeMap::new(), _lock: lock })
+    }
+
+    /// The folder of runs.
+    pub fn path(&self) -> &Path {
+        &self.runs
     }
 
     /// The ledger, oldest first.
@@ -224,65 +220,110 @@ impl Series {
         &self.entries
     }
 
-    /// Whether this very scan has been taken already: same files, sizes and times.
+    /// Whether this very scan has been taken already: same files, sizes and times. Lack of memory or disk does not count for
+    /// ever.
     pub fn has_taken(&self, scan: &Scan) -> bool {
-        let stamp = scan.stamp();
-        self.entries.iter().any(|e| e.scan == scan.name && Some(&e.stamp) == stamp.as_ref())
+        let Some(stamp) = scan.stamp() else { return false };
+        let known = self.entries.iter().rfind(|e| e.scan == scan.name && e.stamp == stamp);
+        known.is_some_and(|e| {
+            e.verdict != Verdict::Resources || self.refused.get(&stamp).is_some_and(|at| at.elapsed() < RETRY_AFTER)
+        })
     }
 
-    /// Maps one scan and writes it into the ledger; what goes wrong with it is a verdict, not an error.
+    /// Chooses the run folder of a scan and the run that it is compared with.
     ///
-    /// # Errors
-    /// [`run_folder::Error`] when the ledger, the page or the pointer cannot be written.
-    pub fn process(
-        &mut self,
-        scan: &Scan,
-        pipeline: &Pipeline,
-        observer: &dyn Observer,
-    ) -> Result<(Entry, Option<serde_json::Value>), run_folder::Error> {
+    /// A folder that holds an accepted run is used again only when the run would do nothing there.
+    pub fn begin(&self, scan: &Scan, pipeline: &Pipeline) -> Job {
         let begun = Instant::now();
-        reset_peak_memory();
         let stamp = scan.stamp().unwrap_or_default();
         let hashes: Vec<String> = scan.files.iter().filter_map(|f| sha256_of(f).ok()).collect();
-        let sha256 = if hashes.len() == 1 { hashes[0].clone() } else { sha256_of_bytes(hashes.concat().as_bytes()) };
-        let folder = format!("{}-{}", scan.name, &sha256[..8]);
+        let sha256 = sha256_of_all(&hashes);
+        let mut run = format!("{}-{}", scan.name, &sha256[..8]);
         let mut own = pipeline.clone();
         own.input = scan.files.clone();
         own.make_inputs_absolute();
-        let result = run(&own, &self.runs.join(&folder), &Redo::default(), observer);
-        let report = result.as_ref().ok().map(|o| o.report.clone());
+        let entry_of = |run: &str| self.entries.iter().find(|e| e.run == run);
+        if entry_of(&run).is_some_and(|e| e.verdict.is_accepted()) && self.would_change(&run, &own) {
+            run += &format!("-{}", &sha256_of_bytes(own.to_toml().as_bytes())[..6]);
+        }
+        let tunnel = scan.tunnel();
+        // A run that is looked at again stays compared with what it was compared with.
+        let before = entry_of(&run).map(|e| e.compared_with.clone());
+        let compared_with = before.unwrap_or_else(|| {
+            let same =
+                self.entries.iter().rev().filter(|e| e.tunnel == tunnel && e.verdict.is_accepted() && e.run != run);
+            let mut there = same.filter(|e| self.runs.join(&e.run).join("report.json").exists());
+            there.next().map(|e| e.run.clone())
+        });
+        Job { scan: scan.clone(), run, compared_with, stamp, sha256, begun }
+    }
+
+    /// Whether a run of this pipeline would change the folder.
+    fn would_change(&self, run: &str, pipeline: &Pipeline) -> bool {
+        let folder = self.runs.join(run);
+        if !folder.exists() {
+            return false;
+        }
+        let same_settings = fs::read_to_string(folder.join("pipeline.toml")).is_ok_and(|t| t == pipeline.to_toml());
+        let stale = |found: Vec<explain::Explanation>| found.iter().any(|e| !e.fresh);
+        // What cannot be explained is said by the run itself.
+        !same_settings || read_record(&folder, "report").is_none() || explain_run(pipeline, &folder).is_ok_and(stale)
+    }
+
+    /// Writes how a run ended into the ledger, the page and the pointer to the last accepted run.
+    ///
+    /// # Errors
+    /// [`run_folder::Error`] when one of them cannot be written.
+    pub fn finish(&mut self, job: Job, ended: Ended) -> Result<Entry, run_folder::Error> {
+        let finished = matches!(ended.verdict, Verdict::Pass | Verdict::Warn | Verdict::Fail);
+        let report = fs::read(self.runs.join(&job.run).join("report.json")).ok().filter(|_| finished);
+        let report: Option<Value> = report.and_then(|text| serde_json::from_slice(&text).ok());
         let number_at = |path: &str| report.as_ref()?.pointer(path)?.as_f64();
+        let told_peak = number_at("/peak_memory_bytes").unwrap_or(0.0) as u64;
         let entry = Entry {
-            scan: scan.name.clone(),
-            files: own.input,
-            stamp,
-            sha256,
-            run: folder,
-            verdict: Verdict::of(&result),
-            message: match &result {
-                Ok(outcome) => broken_limits(&outcome.report),
-                Err(error) => one_line(error),
+            scan: job.scan.name.clone(),
+            tunnel: job.scan.tunnel(),
+            files: job.scan.files.clone(),
+            stamp: job.stamp,
+            sha256: job.sha256,
+            run: job.run,
+            verdict: ended.verdict,
+            message: match (&report, ended.error) {
+                (_, Some(error)) => error.replace('\n', " "),
+                (Some(report), None) => broken_limits(report),
+                (None, None) => String::new(),
             },
             finished_unix_s: SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs(),
-            seconds: begun.elapsed().as_secs_f64(),
+            seconds: job.begun.elapsed().as_secs_f64(),
+            compared_with: job.compared_with,
             points: number_at("/ingest/points"),
             coverage_percent: number_at("/map/coverage_percent"),
             stretch_mean: number_at("/unwrap/stretch/mean"),
-            peak_memory_bytes: peak_memory_bytes(),
+            noise_m: number_at("/profile/noise_whole_m"),
+            peak_memory_bytes: ended.peak_memory_bytes.max(told_peak),
         };
+        if entry.verdict == Verdict::Resources {
+            self.refused.insert(entry.stamp.clone(), Instant::now());
+        }
         self.entries.retain(|e| e.run != entry.run);
         self.entries.push(entry.clone());
-        self.save()?;
+        let text = serde_json::to_vec_pretty(&self.entries).expect("entries are plain data");
+        self.write("runs.json", &text)?;
+        self.write("index.html", series_page::index(&self.entries, &self.runs).as_bytes())?;
         if entry.verdict.is_accepted() {
             self.point_to(&entry.run)?;
         }
-        Ok((entry, report))
+        Ok(entry)
     }
 
-    fn save(&self) -> Result<(), run_folder::Error> {
-        let text = serde_json::to_vec_pretty(&self.entries).expect("entries are plain data");
-        self.write("runs.json", &text)?;
-        self.write("index.html", self.index().as_bytes())
+    /// Keeps the resolved pipeline beside the runs, for the processes that map the scans.
+    ///
+    /// # Errors
+    /// [`run_folder::Error::Io`].
+    pub fn keep_pipeline(&self, pipeline: &Pipeline) -> Result<PathBuf, run_folder::Error> {
+        self.write(PIPELINE, pipeline.to_toml().as_bytes())?;
+        let path = self.runs.join(PIPELINE);
+        std::path::absolute(&path).map_err(|source| run_folder::Error::Io { action: "find", path, source })
     }
 
     fn write(&self, name: &str, content: &[u8]) -> Result<(), run_folder::Error> {
@@ -304,99 +345,14 @@ impl Series {
         Ok(())
     }
 
-    /// The page over all runs, newest first.
-    fn index(&self) -> String {
-        let mut html = String::from(
-            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-             <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><title>Adit runs</title><style>\
-             :root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:70rem;padding:1rem}\
-             table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.25rem .5rem;border-bottom:1px solid #8884}\
-             .pill{border-radius:1rem;padding:.1rem .6rem;color:#fff;background:#b3261e}.pass{background:#1b7f3b}.warn{background:#9a6700}\
-             .scroll{overflow-x:auto}svg{max-width:100%;background:#fff}</style></head><body><h1>Runs</h1>\n",
-        );
-        for (title, value) in [
-            ("Coverage, %", (|e: &Entry| e.coverage_percent) as fn(&Entry) -> Option<f64>),
-            ("Mean stretch", |e| e.stretch_mean),
-            ("Duration, s", |e| Some(e.seconds)),
-        ] {
-            trend(&mut html, title, &self.entries.iter().filter_map(value).collect::<Vec<_>>());
-        }
-        html.push_str("<div class=\"scroll\"><table><tr><th></th><th>Scan</th><th>Points</th><th>Coverage</th><th>Seconds</th><th></th></tr>\n");
-        for e in self.entries.iter().rev() {
-            let optional = |v: Option<f64>| v.map_or("\u{2013}".to_owned(), number);
-            let page = self.runs.join(&e.run).join("report.html");
-            let name = if page.exists() {
-                format!("<a href=\"{0}/report.html\">{1}</a>", escape(&e.run), escape(&e.scan))
-            } else {
-                escape(&e.scan)
-            };
-            let _ = writeln!(
-                html,
-                "<tr><td><span class=\"pill {0}\">{0}</span></td><td>{name}</td><td>{1}</td><td>{2}</td><td>{3}</td><td>{4}</td></tr>",
-                e.verdict.name(),
-                optional(e.points),
-                optional(e.coverage_percent),
-                number(e.seconds.round()),
-                escape(&e.message)
-            );
-        }
-        html.push_str("</table></div></body></html>\n");
-        html
-    }
-
-    /// The metrics of the last run and the counts over all, in the text format of Prometheus.
-    pub fn metrics(&self) -> String {
-        let mut text = String::new();
-        let mut metric = |name: &str, help: &str, values: &[(String, f64)]| {
-            let _ = writeln!(text, "# HELP adit_{name} {help}\n# TYPE adit_{name} gauge");
-            for (labels, value) in values {
-                let _ = writeln!(text, "adit_{name}{labels} {value}");
-            }
-        };
-        let success = self.entries.iter().filter(|e| e.verdict.is_accepted()).map(|e| e.finished_unix_s).max();
-        let one = |value: f64| vec![(String::new(), value)];
-        metric("last_success_time_seconds", "End of the last accepted run.", &one(success.unwrap_or(0) as f64));
-        let verdicts = [
-            Verdict::Pass,
-            Verdict::Warn,
-            Verdict::Fail,
-            Verdict::BadInput,
-            Verdict::Unsupported,
-            Verdict::Resources,
-            Verdict::Usage,
-            Verdict::Internal,
-        ];
-        let counts = verdicts.map(|v| {
-            let count = self.entries.iter().filter(|e| e.verdict == v).count();
-            (format!("{{verdict=\"{}\"}}", v.name()), count as f64)
-        });
-        metric("runs", "Runs in the folder by verdict.", &counts);
-        if let Some(last) = self.entries.last() {
-            metric("last_duration_seconds", "Duration of the last run.", &one(last.seconds));
-            metric("last_points", "Points of the last run.", &one(last.points.unwrap_or(0.0)));
-            metric(
-                "last_coverage_percent",
-                "Observed share of the last map.",
-                &one(last.coverage_percent.unwrap_or(0.0)),
-            );
-            metric(
-                "last_accepted",
-                "Whether the last run was accepted.",
-                &one(f64::from(u8::from(last.verdict.is_accepted()))),
-            );
-            metric("last_peak_memory_bytes", "Peak memory of the last run.", &one(last.peak_memory_bytes as f64));
-        }
-        text
-    }
-
-    /// Writes [`Self::metrics`] to a file that a collector reads.
+    /// Writes the metrics of all runs to a file that a Prometheus text collector reads.
     ///
     /// # Errors
     /// [`run_folder::Error::Io`].
     pub fn write_metrics(&self, path: &Path) -> Result<(), run_folder::Error> {
         let mut temporary = path.as_os_str().to_owned();
         temporary.push(".tmp");
-        write_atomically(path, Path::new(&temporary), self.metrics().as_bytes())
+        write_atomically(path, Path::new(&temporary), series_page::metrics(&self.entries).as_bytes())
     }
 
     /// The runs that a keep policy gives up, oldest first: not among the newest `keep_last`, older than `older_than`,
@@ -422,38 +378,15 @@ impl Series {
         if !path.exists() {
             return Ok(());
         }
-        drop(run_folder::RunFolder::open(&path)?);
-        fs::remove_dir_all(&path).map_err(|source| run_folder::Error::Io { action: "remove", path, source })
+        run_folder::remove(&path)
     }
-}
-
-fn trend(html: &mut String, title: &str, values: &[f64]) {
-    if values.len() < 2 {
-        return;
-    }
-    let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-    let mut line = String::new();
-    for (i, value) in values.iter().enumerate() {
-        let x = 10.0 + 580.0 * i as f64 / (values.len() - 1) as f64;
-        let _ = write!(line, "{x:.1},{:.1} ", 70.0 - 60.0 * (value - low) / (high - low).max(1e-9));
-    }
-    let _ = writeln!(
-        html,
-        "<figure><svg viewBox=\"0 0 600 80\" width=\"600\"><polyline points=\"{line}\" fill=\"none\" stroke=\"#1a5fb4\" stroke-width=\"2\"/></svg>\
-         <figcaption>{title}: {} to {}</figcaption></figure>",
-        number(low),
-        number(high)
-    );
 }
 
 fn broken_limits(report: &serde_json::Value) -> String {
     let checks = report.get("limits").and_then(|l| l.as_array()).into_iter().flatten();
-    let broken = checks.filter(|c| c.get("status").and_then(|s| s.as_str()) != Some("pass"));
+    let is_broken = |c: &&Value| matches!(c.get("status").and_then(|s| s.as_str()), Some("warn" | "fail"));
+    let broken = checks.filter(is_broken);
     broken.filter_map(|c| c.get("message")?.as_str()).collect::<Vec<_>>().join("; ")
-}
-
-fn one_line(error: &Error) -> String {
-    error.to_string().replace('\n', " ")
 }
 
 #[cfg(test)]
@@ -463,6 +396,7 @@ mod tests {
     fn entry(run: &str, verdict: Verdict, finished: u64) -> Entry {
         Entry {
             scan: run.to_owned(),
+            tunnel: run.to_owned(),
             files: vec![],
             stamp: String::new(),
             sha256: String::new(),
@@ -471,9 +405,11 @@ mod tests {
             message: String::new(),
             finished_unix_s: finished,
             seconds: 1.0,
+            compared_with: None,
             points: None,
             coverage_percent: None,
             stretch_mean: None,
+            noise_m: None,
             peak_memory_bytes: 0,
         }
     }
@@ -501,27 +437,58 @@ mod tests {
         assert!(matches!(Series::open(place.path()), Err(run_folder::Error::Locked { .. })));
     }
 
-    #[test]
-    fn scans_settle_by_age_or_by_marker() {
-        let place = tempfile::tempdir().unwrap();
-        let file = place.path().join("a.laz");
-        fs::write(&file, b"x").unwrap();
-        fs::write(place.path().join("notes.md"), b"x").unwrap();
-        fs::write(place.path().join(".b.laz"), b"x").unwrap();
-        let scans = Scan::in_folder(place.path()).unwrap();
-        assert_eq!(scans.len(), 1);
-        assert!(!scans[0].is_settled(Duration::from_secs(3600)) && scans[0].is_settled(Duration::ZERO));
-        fs::write(place.path().join("a.laz.done"), b"").unwrap();
-        assert!(scans[0].is_settled(Duration::from_secs(3600)));
+    /// A run folder with a report of a scan, entered into the ledger.
+    fn run_of(series: &mut Series, file: &Path, content: &str, verdict: Verdict) -> Entry {
+        fs::write(file, content).unwrap();
+        let job = series.begin(&Scan::of_file(file), &Pipeline::default());
+        let folder = series.path().join(&job.run);
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("report.json"), "{}").unwrap();
+        series.finish(job, Ended { verdict, error: None, peak_memory_bytes: 7 }).unwrap()
     }
 
     #[test]
-    fn metrics_count_by_verdict() {
-        let place = tempfile::tempdir().unwrap();
+    fn a_scan_is_compared_with_the_last_accepted_one_of_its_tunnel() {
+        let (place, incoming) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let mut series = Series::open(place.path()).unwrap();
-        series.entries = vec![entry("a", Verdict::Pass, 10), entry("b", Verdict::BadInput, 20)];
-        let text = series.metrics();
-        assert!(text.contains("adit_last_success_time_seconds 10\n"), "{text}");
-        assert!(text.contains("adit_runs{verdict=\"bad-input\"} 1\n") && text.contains("adit_last_accepted 0\n"));
+        let file = |name: &str| incoming.path().join(name);
+        let first = run_of(&mut series, &file("drift_2026-01-01.xyz"), "1", Verdict::Pass);
+        let bad = run_of(&mut series, &file("drift_2026-01-02.xyz"), "2", Verdict::Fail);
+        let other = run_of(&mut series, &file("shaft_2026-01-02.xyz"), "3", Verdict::Pass);
+        let second = run_of(&mut series, &file("drift_2026-01-03.xyz"), "4", Verdict::Pass);
+        assert_eq!((first.compared_with, other.compared_with), (None, None));
+        assert_eq!((bad.compared_with, second.compared_with), (Some(first.run.clone()), Some(first.run)));
+        // What was rejected is not the latest.
+        let latest = || fs::read_to_string(place.path().join("latest.txt")).unwrap();
+        assert_eq!(latest().trim(), second.run);
+        run_of(&mut series, &file("drift_2026-01-04.xyz"), "5", Verdict::Fail);
+        assert_eq!(latest().trim(), second.run);
+    }
+
+    #[test]
+    fn an_accepted_map_is_not_overwritten_by_other_settings() {
+        let (place, incoming) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let mut series = Series::open(place.path()).unwrap();
+        let file = incoming.path().join("drift.xyz");
+        let accepted = run_of(&mut series, &file, "1", Verdict::Pass);
+        let other = Pipeline::from_overrides(&["map.cell_m=0.5".to_owned()]).unwrap();
+        let run = series.begin(&Scan::of_file(&file), &other).run;
+        assert!(run.starts_with(&accepted.run) && run != accepted.run, "{run}");
+        // A rejected one may be done again in its place.
+        let rejected = run_of(&mut series, &file, "2", Verdict::Fail);
+        assert_eq!(series.begin(&Scan::of_file(&file), &other).run, rejected.run);
+    }
+
+    #[test]
+    fn lack_of_memory_is_tried_again_by_the_next_process() {
+        let (place, incoming) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let mut series = Series::open(place.path()).unwrap();
+        let (big, broken) = (incoming.path().join("big.xyz"), incoming.path().join("broken.xyz"));
+        run_of(&mut series, &big, "1", Verdict::Resources);
+        run_of(&mut series, &broken, "2", Verdict::BadInput);
+        let taken = |series: &Series| [&big, &broken].map(|f| series.has_taken(&Scan::of_file(f)));
+        assert_eq!(taken(&series), [true, true]);
+        drop(series);
+        assert_eq!(taken(&Series::open(place.path()).unwrap()), [false, true]);
     }
 }

@@ -5,6 +5,7 @@
 
 use super::known_keys::KnownKeys;
 use super::limits::Limits;
+use super::profile;
 use crate::{axis, clean, cut, io, map, mesh, segment, unwrap};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -36,6 +37,8 @@ pub struct Pipeline {
     pub anchor: mesh::anchor::Settings,
     /// Drawing the map.
     pub map: map::Settings,
+    /// What is told along the tunnel.
+    pub profile: profile::Settings,
     /// When a finished run counts as good: levels that make it warn or fail.
     pub limits: Limits,
 }

@@ -16,5 +16,5 @@ mod read;
 mod records;
 mod rewrite;
 
-pub(super) use read::read;
+pub(super) use read::{announced_points, read};
 pub(super) use rewrite::{rewrite, write_new};

@@ -13,6 +13,18 @@ use crate::warning::Warning;
 use laz::DecompressionSelection;
 use rayon::prelude::*;
 
+/// How many points the header counts, and its bounding box in metres; the file holds the points, or (LAZ) the chunks that
+/// its table lists.
+pub(in super::super) fn announced_points(source: &SourceBytes) -> Result<(u64, Option<[[f64; 3]; 2]>), Error> {
+    let container = Container::read(source)?;
+    Records::plan(source, &container, false, &mut Vec::new())?;
+    let unit = super::crs::of(&container).and_then(|c| c.metres_per_unit).unwrap_or(1.0);
+    let sound =
+        (0..3).all(|i| container.max[i] > container.min[i] && (container.max[i] - container.min[i]).is_finite());
+    let bounds = sound.then(|| [container.min.map(|v| v * unit), container.max.map(|v| v * unit)]);
+    Ok((container.count, bounds))
+}
+
 /// Reads one LAS or LAZ file; positions are relative to `origin`, or to one chosen from the header.
 pub(in super::super) fn read(
     source: &SourceBytes,

@@ -127,6 +127,28 @@ pub(super) enum Encoding {
     BigEndian,
 }
 
+/// How many vertices the header counts; a binary file must hold all its elements, lists with their fewest entries.
+pub(in super::super) fn announced_vertices(source: &SourceBytes) -> Result<u64, Error> {
+    let header = Header::read(source)?;
+    if header.encoding != Encoding::Ascii {
+        let record = |element: &Element| -> usize {
+            let faces = element.name == "face";
+            let property = |p: &Property| match p.kind {
+                Kind::Scalar(s) => s.size(),
+                // A face has at least three corners.
+                Kind::List(count, item) => {
+                    count.size() + if faces && p.name.starts_with("vert") { 3 * item.size() } else { 0 }
+                }
+            };
+            element.properties.iter().map(property).sum()
+        };
+        let bytes = |e: &Element| e.count.saturating_mul(record(e) as u64);
+        let needed = header.elements.iter().map(bytes).fold(header.data_at, u64::saturating_add);
+        super::super::announce::must_hold(source, needed, "its element counts")?;
+    }
+    Ok(header.element("vertex").map_or(0, |(_, vertices)| vertices.count))
+}
+
 /// A parsed header.
 #[derive(Clone, Debug)]
 pub(super) struct Header {

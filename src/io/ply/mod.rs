@@ -13,6 +13,7 @@ mod placed_points;
 mod read;
 mod rewrite;
 
+pub(super) use header::announced_vertices;
 pub(super) use mesh::read_mesh;
 pub use mesh::{PlyMesh, RawMesh, read_chart, write_mesh};
 pub(super) use placed_points::placed_points;
