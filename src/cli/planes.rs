@@ -310,7 +310,7 @@ fn read_csv(path: &Path, needed: &[&str], optional: &[&str]) -> Result<Vec<Vec<O
                 )));
             }
             let value = |n: &&str| place(n).map(|i| cells[i].to_owned()).filter(|c| !c.is_empty());
-            Ok(needed.iter().chain(optional).map(|n| value(n)).collect())
+            Ok(needed.iter().chain(optional).map(value).collect())
         })
         .collect()
 }

@@ -69,11 +69,21 @@ struct Stroke {
     line: Vec<Vec2>,
 }
 
+/// The outlines of a broad piece in pixels of the map.
+struct Patch {
+    label: Label,
+    width_px: f64,
+    rings: Vec<Vec<Vec2>>,
+}
+
+/// A line of a list and which of its ends: 0 its first vertex, 1 its last.
+type End = (usize, usize);
+
 /// Lines and areas of all classes but 0, on the map; `classes` gives their names.
 pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettings) -> (Vec<Feature>, StrokeSummary) {
     let mut summary = StrokeSummary::default();
     let cell = map.placement.step_u.abs();
-    let (mut lines, mut areas): (Vec<Stroke>, Vec<(Label, f64, Vec<Vec<Vec2>>)>) = (Vec::new(), Vec::new());
+    let (mut lines, mut areas): (Vec<Stroke>, Vec<Patch>) = (Vec::new(), Vec::new());
     for piece in pieces(map) {
         if piece.pixels < settings.least_px {
             summary.specks += 1;
@@ -95,7 +105,7 @@ pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettin
             }
         } else {
             let rings = mask.outlines().iter().map(|ring| ring.iter().map(in_map).collect()).collect();
-            areas.push((piece.label, width_px, rings));
+            areas.push(Patch { label: piece.label, width_px, rings });
         }
     }
     summary.gaps = close_gaps(&mut lines, settings.gap_m / cell);
@@ -122,7 +132,7 @@ pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettin
     let mut features: Vec<Feature> =
         lines.map(|(i, s)| feature("traces", i, Kind::Line, s.label, s.width_px, vec![s.line])).collect();
     let areas = areas.into_iter().enumerate();
-    features.extend(areas.map(|(i, (label, width, rings))| feature("patches", i, Kind::Area, label, width, rings)));
+    features.extend(areas.map(|(i, p)| feature("patches", i, Kind::Area, p.label, p.width_px, p.rings)));
     (features, summary)
 }
 
@@ -141,7 +151,7 @@ fn close_gaps(strokes: &mut Vec<Stroke>, longest_px: f64) -> usize {
     let mut closed = 0;
     loop {
         let ends: Vec<[(Vec2, Vec2); 2]> = strokes.iter().map(|s| [end(&s.line, 0), end(&s.line, 1)]).collect();
-        let mut best: Option<(f64, (usize, usize), (usize, usize))> = None;
+        let mut best: Option<(f64, End, End)> = None;
         for i in 0..strokes.len() {
             for j in i + 1..strokes.len() {
                 if strokes[i].label != strokes[j].label {
@@ -507,7 +517,7 @@ fn joined(mut branches: Vec<Branch>, junctions: usize, skip: usize) -> Vec<Vec<V
                 .enumerate()
                 .flat_map(|(b, branch)| (0..2).filter(move |&e| branch.ends[e] == Some(j)).map(move |e| (b, e)))
                 .collect();
-            let mut best: Option<(f64, (usize, usize), (usize, usize))> = None;
+            let mut best: Option<(f64, End, End)> = None;
             for (i, &a) in ends.iter().enumerate() {
                 for &b in ends[i + 1..].iter().filter(|b| b.0 != a.0) {
                     let straight = -branches[a.0].direction(a.1, skip).dot(&branches[b.0].direction(b.1, skip));
