@@ -9,6 +9,10 @@ trap 'rm -rf "$work"' EXIT
 cargo run --release --locked --quiet -- run --input sample_scans/bent_drift.laz --out "$work/run" --set map.cell_m=0.01 ||
     [ $? -eq 5 ] # a broken quality limit is told in the report and makes no worse pictures
 
+# The sample's points carry the labels of its fractures, so its label map has their traces.
+cargo run --release --locked --quiet -- trace "$work/run" --labels "$work/run/map/labels.png" --out "$work/traces.gpkg" --quiet
+cargo run --release --locked --quiet -- planes "$work/run" --traces "$work/traces.gpkg" --out "$work/run/map" --quiet
+
 python3 - "$work/run/map" docs/pictures <<'PYTHON'
 import sys
 from pathlib import Path
@@ -22,6 +26,7 @@ for layer, name, width, colors in [
     ("distortion", "sample_distortion", 700, 64),
     ("offset", "sample_offset", 700, 64),
     ("labels", "sample_labels", 700, 16),
+    ("stereonet", "sample_stereonet", 700, 32),
 ]:
     picture = Image.open(source / f"{layer}.png").convert("RGBA")
     paper = Image.new("RGBA", picture.size, "white")

@@ -142,7 +142,7 @@ fn fit(arguments: &Arguments, console: &Console) -> Result {
         "without_plane": found.iter().filter(|p| p.fit.is_none()).count(),
         "limits": {
             "least_m": settings.least_m, "greatest_k": settings.greatest_k,
-            "greatest_angle_95_deg": settings.greatest_angle_deg, "noise_m": settings.noise_m,
+            "greatest_angle_95_deg": settings.greatest_angle_deg, "sure_angle_95_deg": settings.sure_angle_deg, "noise_m": settings.noise_m,
             "correlation_m": settings.correlation_m,
         },
         "drape": draped.summary,
@@ -310,7 +310,7 @@ fn read_csv(path: &Path, needed: &[&str], optional: &[&str]) -> Result<Vec<Vec<O
                 )));
             }
             let value = |n: &&str| place(n).map(|i| cells[i].to_owned()).filter(|c| !c.is_empty());
-            Ok(needed.iter().chain(optional).map(|n| value(n)).collect())
+            Ok(needed.iter().chain(optional).map(value).collect())
         })
         .collect()
 }

@@ -50,8 +50,9 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let shapes = [Shapes { space: Space::Scan, features: &in_scan }, Shapes { space: Space::Map, features: &on_map }];
     tell(console, &vector::write(&arguments.out, &shapes).map_err(io_failure)?);
     console.say(&format!(
-        "{told}{} strokes and {} areas; {} specks and {} twigs left out\nwrote {}",
+        "{told}{} strokes ({} gaps closed) and {} areas; {} specks and {} twigs left out\nwrote {}",
         found.strokes,
+        found.gaps,
         found.areas,
         found.specks,
         found.twigs,

@@ -96,6 +96,6 @@ fn offsets(metadata: &str) -> Vec<f64> {
         let value = item.split('>').nth(1).and_then(|s| s.split('<').next()).and_then(|s| s.trim().parse().ok());
         found.extend(sample.zip(value));
     }
-    found.sort_by(|a, b| a.0.cmp(&b.0));
+    found.sort_by_key(|f| f.0);
     found.into_iter().map(|f| f.1).collect()
 }

@@ -27,11 +27,14 @@ pub struct StrokeSettings {
     pub least_px: usize,
     /// How far the line may be from the middle of the pixels, pixels.
     pub tolerance_px: f64,
+    /// Strokes of one class that continue each other over a gap of at most this, metres, are one: another stroke was
+    /// painted over them there.
+    pub gap_m: f64,
 }
 
 impl Default for StrokeSettings {
     fn default() -> Self {
-        Self { max_width_m: 0.12, least_px: 12, tolerance_px: 0.6 }
+        Self { max_width_m: 0.12, least_px: 12, tolerance_px: 0.6, gap_m: 0.15 }
     }
 }
 
@@ -46,21 +49,41 @@ pub struct StrokeSummary {
     pub specks: usize,
     /// Twigs of the middle lines that were dropped.
     pub twigs: usize,
+    /// Gaps that were closed.
+    pub gaps: usize,
 }
 
 /// A branch joins another across a junction when it bends less than this there: cosine of 50 degrees.
 const STRAIGHT_ON: f64 = 0.64;
 /// Pixels over which the direction of a branch at its end is taken.
 const DIRECTION_PX: usize = 12;
+/// Strokes continue each other over a gap when both bend less than this there: cosine of 25 degrees.
+const FACING: f64 = 0.9;
 /// Half the window, in pixels, over which pixel steps are smoothed.
 const SMOOTHING_PX: usize = 4;
+
+/// A middle line in pixels of the map.
+struct Stroke {
+    label: Label,
+    width_px: f64,
+    line: Vec<Vec2>,
+}
+
+/// The outlines of a broad piece in pixels of the map.
+struct Patch {
+    label: Label,
+    width_px: f64,
+    rings: Vec<Vec<Vec2>>,
+}
+
+/// A line of a list and which of its ends: 0 its first vertex, 1 its last.
+type End = (usize, usize);
 
 /// Lines and areas of all classes but 0, on the map; `classes` gives their names.
 pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettings) -> (Vec<Feature>, StrokeSummary) {
     let mut summary = StrokeSummary::default();
-    let mut features = Vec::new();
-    let mut ids: BTreeMap<Kind, i64> = BTreeMap::new();
     let cell = map.placement.step_u.abs();
+    let (mut lines, mut areas): (Vec<Stroke>, Vec<Patch>) = (Vec::new(), Vec::new());
     for piece in pieces(map) {
         if piece.pixels < settings.least_px {
             summary.specks += 1;
@@ -68,47 +91,94 @@ pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettin
         }
         let mask = Mask::of(map, &piece);
         let depth = mask.depth();
-        let half_width = depth.iter().copied().max().unwrap_or(0) as f64;
+        let half_width = f64::from(depth.iter().copied().max().unwrap_or(0));
         let width_px = mask.greatest_width(&depth);
         let length_px = piece.pixels as f64 / width_px.max(1.0);
-        let is_stroke = width_px * cell <= settings.max_width_m && length_px > 3.0 * width_px;
-        let on_map = |p: Vec2| {
-            let uv = map.placement.chart_from_pixel(p + Vec2::new(piece.left as f64 - 1.0, piece.top as f64 - 1.0));
-            Vec3::new(uv.x, uv.y, 0.0)
-        };
-        let (kind, class, lines) = if is_stroke {
-            let (lines, twigs) = middle_lines(&mask, half_width);
+        let in_map = |p: &Vec2| p + Vec2::new(piece.left as f64 - 1.0, piece.top as f64 - 1.0);
+        if width_px * cell <= settings.max_width_m && length_px > 3.0 * width_px {
+            let (found, twigs) = middle_lines(&mask, half_width);
             summary.twigs += twigs;
-            let simple = lines.into_iter().map(|line| {
+            for line in found {
                 let long = lengthened(&smoothed(&line), &mask, half_width);
-                simplified(&long, settings.tolerance_px)
-            });
-            (Kind::Line, "traces", simple.map(|line| vec![line]).collect::<Vec<_>>())
-        } else {
-            (Kind::Area, "patches", vec![mask.outlines()])
-        };
-        let name = classes.iter().find(|c| c.value == piece.label).map_or_else(String::new, |c| c.name.clone());
-        for rings in lines {
-            let id = ids.entry(kind).or_insert(0);
-            *id += 1;
-            match kind {
-                Kind::Area => summary.areas += 1,
-                _ => summary.strokes += 1,
+                let line = simplified(&long, settings.tolerance_px).iter().map(in_map).collect();
+                lines.push(Stroke { label: piece.label, width_px, line });
             }
-            features.push(Feature {
-                class: class.to_owned(),
-                id: Some(*id),
-                attributes: vec![
-                    ("label".into(), Value::Integer(i64::from(piece.label))),
-                    ("name".into(), Value::Text(name.clone())),
-                    ("stroke_width_m".into(), Value::Real(width_px * cell)),
-                ],
-                kind,
-                parts: rings.iter().map(|ring| ring.iter().map(|p| on_map(*p)).collect()).collect(),
-            });
+        } else {
+            let rings = mask.outlines().iter().map(|ring| ring.iter().map(in_map).collect()).collect();
+            areas.push(Patch { label: piece.label, width_px, rings });
         }
     }
+    summary.gaps = close_gaps(&mut lines, settings.gap_m / cell);
+    (summary.strokes, summary.areas) = (lines.len(), areas.len());
+    let feature = |class: &str, id: usize, kind: Kind, label: Label, width_px: f64, parts: Vec<Vec<Vec2>>| {
+        let on_map = |p: &Vec2| {
+            let uv = map.placement.chart_from_pixel(*p);
+            Vec3::new(uv.x, uv.y, 0.0)
+        };
+        let name = classes.iter().find(|c| c.value == label).map_or_else(String::new, |c| c.name.clone());
+        Feature {
+            class: class.to_owned(),
+            id: Some(id as i64 + 1),
+            attributes: vec![
+                ("label".into(), Value::Integer(i64::from(label))),
+                ("name".into(), Value::Text(name)),
+                ("stroke_width_m".into(), Value::Real(width_px * cell)),
+            ],
+            kind,
+            parts: parts.iter().map(|part| part.iter().map(on_map).collect()).collect(),
+        }
+    };
+    let lines = lines.into_iter().enumerate();
+    let mut features: Vec<Feature> =
+        lines.map(|(i, s)| feature("traces", i, Kind::Line, s.label, s.width_px, vec![s.line])).collect();
+    let areas = areas.into_iter().enumerate();
+    features.extend(areas.map(|(i, p)| feature("patches", i, Kind::Area, p.label, p.width_px, p.rings)));
     (features, summary)
+}
+
+/// Joins strokes of one class whose ends face each other over a gap, the narrowest gap first; how many were closed.
+fn close_gaps(strokes: &mut Vec<Stroke>, longest_px: f64) -> usize {
+    // The end and the outward direction there, over some pixels.
+    let end = |line: &[Vec2], e: usize| -> (Vec2, Vec2) {
+        let mut ordered: Vec<Vec2> = line.to_vec();
+        if e == 0 {
+            ordered.reverse();
+        }
+        let last = ordered[ordered.len() - 1];
+        let from = ordered.iter().rev().find(|p| (last - **p).norm() >= DIRECTION_PX as f64).unwrap_or(&ordered[0]);
+        (last, (last - from).try_normalize(0.0).unwrap_or_else(Vec2::zeros))
+    };
+    let mut closed = 0;
+    loop {
+        let ends: Vec<[(Vec2, Vec2); 2]> = strokes.iter().map(|s| [end(&s.line, 0), end(&s.line, 1)]).collect();
+        let mut best: Option<(f64, End, End)> = None;
+        for i in 0..strokes.len() {
+            for j in i + 1..strokes.len() {
+                if strokes[i].label != strokes[j].label {
+                    continue;
+                }
+                for (e, f) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                    let ((p, out), (q, other)) = (ends[i][e], ends[j][f]);
+                    let gap = (q - p).norm();
+                    let faces = -out.dot(&other) >= FACING && (gap < 2.0 || out.dot(&(q - p)) >= FACING * gap);
+                    if gap <= longest_px && faces && best.is_none_or(|b| gap < b.0) {
+                        best = Some((gap, (i, e), (j, f)));
+                    }
+                }
+            }
+        }
+        let Some((_, (i, e), (j, f))) = best else { return closed };
+        let mut other = strokes.remove(j).line;
+        let line = &mut strokes[i].line;
+        if e == 0 {
+            line.reverse();
+        }
+        if f == 1 {
+            other.reverse();
+        }
+        line.append(&mut other);
+        closed += 1;
+    }
 }
 
 /// A connected piece of one class and the box around it.
@@ -447,7 +517,7 @@ fn joined(mut branches: Vec<Branch>, junctions: usize, skip: usize) -> Vec<Vec<V
                 .enumerate()
                 .flat_map(|(b, branch)| (0..2).filter(move |&e| branch.ends[e] == Some(j)).map(move |e| (b, e)))
                 .collect();
-            let mut best: Option<(f64, (usize, usize), (usize, usize))> = None;
+            let mut best: Option<(f64, End, End)> = None;
             for (i, &a) in ends.iter().enumerate() {
                 for &b in ends[i + 1..].iter().filter(|b| b.0 != a.0) {
                     let straight = -branches[a.0].direction(a.1, skip).dot(&branches[b.0].direction(b.1, skip));
@@ -609,6 +679,15 @@ mod tests {
             let near = segments.iter().filter(|s| line.parts[0].iter().all(|p| distance(p, **s) < 3.0 * CELL)).count();
             assert_eq!(near, 1, "a line follows one of the strokes");
         }
+    }
+
+    #[test]
+    fn a_stroke_that_was_painted_over_is_one_line() {
+        let (under, over) = ([0.5, 0.5, 5.5, 3.5], [3.0, 0.4, 2.8, 3.6]);
+        let (found, summary) = strokes(&painted(&[(7, over, 0.06), (2, under, 0.04)]), &[], &StrokeSettings::default());
+        assert_eq!((summary.strokes, summary.gaps), (2, 1), "{summary:?}");
+        let whole = found.iter().find(|f| f.attribute("label") == Some(&Value::Integer(2))).unwrap();
+        assert!((whole.length() / 5f64.hypot(3.0) - 1.0).abs() < 0.03, "{}", whole.length());
     }
 
     #[test]

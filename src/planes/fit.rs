@@ -12,7 +12,8 @@
 //! variance s^2 / (n l2) and about the second with s^2 / (n l1), where s^2 = max(l3, noise^2) n / (n - 3) and n is the
 //! number of independent places of the trace, its length over the length along which errors of the hand, of the pixels and
 //! of the surface hang together. The factor is Student's t for n - 3 degrees of freedom. An orientation is accepted when M,
-//! K and this angle all keep to their limits.
+//! K and this angle all keep to their limits; K may be greater when the angle is small, because a long trace that is nearly
+//! straight can still be known well (K only compares proportions).
 //!
 //! Departures: the noise floor and n are stated assumptions, not estimates. Cost: linear.
 
@@ -28,6 +29,8 @@ pub struct FitSettings {
     pub greatest_k: f64,
     /// Greatest angle of 95 % confidence, degrees.
     pub greatest_angle_deg: f64,
+    /// K may be greater when the angle of confidence is at most this, degrees: the length of the trace makes up for it.
+    pub sure_angle_deg: f64,
     /// Distance from the plane that a trace has at least, however even it looks, metres: pixels, scanner, surface.
     pub noise_m: f64,
     /// Length along the trace over which errors hang together, metres.
@@ -36,7 +39,14 @@ pub struct FitSettings {
 
 impl Default for FitSettings {
     fn default() -> Self {
-        Self { least_m: 4.0, greatest_k: 0.8, greatest_angle_deg: 5.0, noise_m: 0.01, correlation_m: 0.3 }
+        Self {
+            least_m: 4.0,
+            greatest_k: 0.8,
+            greatest_angle_deg: 5.0,
+            sure_angle_deg: 3.0,
+            noise_m: 0.01,
+            correlation_m: 0.3,
+        }
     }
 }
 
@@ -109,12 +119,7 @@ pub fn fit_points(points: &[(Vec3, f64)], settings: &FitSettings) -> Option<Plan
     let centre = points.iter().map(|(p, w)| p * *w).sum::<Vec3>() / area;
     let moments = points.iter().map(|(p, w)| (p - centre) * (p - centre).transpose() * *w).sum::<Mat3>() / area;
     let independent = area / (settings.correlation_m * settings.correlation_m);
-    let mut fit = judged(centre, moments, area.sqrt(), independent, settings);
-    // K tells lines from planes along a trace; a patch has l1 near l2 by nature, its M does the work.
-    if fit.k > settings.greatest_k && fit.m >= settings.least_m && fit.angle_95_deg <= settings.greatest_angle_deg {
-        fit.reliability = Reliability::Unreliable(format!("the patch is a strip: K is {:.2}", fit.k));
-    }
-    Some(fit)
+    Some(judged(centre, moments, area.sqrt(), independent, settings))
 }
 
 fn judged(centre: Vec3, moments: Mat3, length: f64, independent: f64, settings: &FitSettings) -> PlaneFit {
@@ -133,7 +138,7 @@ fn judged(centre: Vec3, moments: Mat3, length: f64, independent: f64, settings: 
     if !(m >= settings.least_m) {
         reasons.push(format!("M is {m:.2}, less than {}", settings.least_m));
     }
-    if !(k <= settings.greatest_k) {
+    if !(k <= settings.greatest_k || angle_95_deg <= settings.sure_angle_deg) {
         reasons.push(format!("K is {k:.2}, more than {}: nearly a straight line", settings.greatest_k));
     }
     if !(angle_95_deg <= settings.greatest_angle_deg) {

@@ -10,7 +10,7 @@ mod shapefile;
 mod wkb;
 
 use super::Error;
-use crate::linework::{Feature, Kind, Value};
+use crate::linework::{Feature, Value};
 use crate::warning::Warning;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -210,6 +210,7 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::linework::Kind;
     use crate::numeric::Vec3;
 
     fn feature(class: &str, id: i64, kind: Kind, parts: Vec<Vec<Vec3>>) -> Feature {
