@@ -572,3 +572,47 @@ pub(super) fn describe(axis: &Axis, source: Source, warnings: Vec<Warning>) -> S
         warnings,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clean;
+    use crate::synthetic::{Course, Recipe, Shape, scan};
+
+    /// Length of the traced axis, and its greatest angle to the true one in degrees.
+    fn length_and_angle(recipe: &Recipe) -> (f64, f64) {
+        let tunnel = recipe.tunnel().unwrap();
+        let scan = scan(&tunnel, &recipe.plan().unwrap()).unwrap();
+        let (geometry, _) = clean::clean(&scan.cloud, &clean::Settings::default()).unwrap();
+        let (axis, _) = trace(geometry.positions(), &Settings::default()).unwrap();
+        let truth = tunnel.axis();
+        let steps = 40;
+        let angle = |i: i32| {
+            let frame = axis.frame_at(axis.start_chainage() + axis.length() * f64::from(i) / f64::from(steps));
+            let there = truth.frame_at(truth.project(&frame.origin).chainage).forward;
+            frame.forward.cross(&there).norm().atan2(frame.forward.dot(&there).abs()).to_degrees()
+        };
+        (axis.length(), (0..=steps).map(angle).fold(0.0, f64::max))
+    }
+
+    #[test]
+    fn tunnels_hardly_longer_than_wide_get_a_sober_axis() {
+        let horseshoe = Shape::Horseshoe { width_m: 4.6, height_m: 4.2 };
+        let circle = Shape::Circle { radius_m: 2.0 };
+        for (shape, length_m, course) in [
+            (horseshoe, 7.0, Course::Straight),
+            (horseshoe, 8.0, Course::Bend),
+            (horseshoe, 12.0, Course::Ramp),
+            (circle, 8.0, Course::Straight),
+        ] {
+            let recipe = Recipe { shape, length_m, course, points: 40_000, furniture: vec![], ..Recipe::default() };
+            let (length, angle) = length_and_angle(&recipe);
+            // A straight axis through a short bend is off by half the turn at its ends.
+            let half_turn = if course == Course::Bend { (length_m / recipe.radius_m / 2.0).to_degrees() } else { 0.0 };
+            assert!(
+                (length - length_m).abs() < 0.05 * length_m && angle < half_turn + 1.5,
+                "{shape:?} {length_m} m {course:?}: length {length:.2} m, {angle:.1} degrees off"
+            );
+        }
+    }
+}
