@@ -1,27 +1,45 @@
 #!/bin/sh
 # Makes the tables and pictures of docs/methods/comparison.md again, with the program, from tunnels of its own generator.
-# Takes about a quarter of an hour; the figures of time and memory are those of the machine it runs on.
+# Takes a few minutes; the figures of time and memory are those of the machine it runs on.
 set -eu
 cd "$(dirname "$0")/.."
 work=${1:-$(mktemp -d)}
 mkdir -p "$work" docs/pictures
-adit() { cargo run --release --locked --quiet --bin adit -- "$@"; }
+# ADIT names the program if it is built already.
+adit() {
+    if [ -n "${ADIT:-}" ]; then "$ADIT" "$@"; else cargo run --release --locked --quiet --bin adit -- "$@"; fi
+}
 
 # The tunnel of the comparison: 8.2 m x 6.7 m x 41 m, rough, gently bent, nothing in the way.
 adit synth --out "$work/tunnel.laz" --section horseshoe:8.2x6.7 --alignment bend --radius 120 --length 41 \
     --roughness 0.12 --furniture none --points 2000000 --stations 6 --noise-mm 2 --outliers 0 --seed 41
 adit compare-methods "$work/tunnel.laz" --set mesh.spacing_m=0.15 --out "$work/tunnel"
 
-# The trade-off of relax: the same section on a bend of 20 m.
+# Full Newton ABF is for small meshes: the same tunnel, coarser.
+adit compare-methods "$work/tunnel.laz" --set mesh.spacing_m=0.25 --methods abf,abf++ --out "$work/coarse"
+
+# The same section on a bend of 20 m: all methods, and the trade-off of relax.
 adit synth --out "$work/bend.laz" --section horseshoe:8.2x6.7 --alignment bend --radius 20 --length 30 \
     --roughness 0.12 --furniture none --points 1500000 --stations 6 --noise-mm 2 --outliers 0 --seed 20
-adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/bend" --methods \
+adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/bend" \
+    --methods section,lscm,relax,abf++,arap,slim,deform-arap,deform-skin
+adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/curve" --methods \
     section,arap,relax:straightness=0,relax:straightness=0.1,relax:straightness=0.25,relax:straightness=0.5,relax:straightness=0.75,relax:straightness=0.9,relax:straightness=1
 
 cp "$work/tunnel/comparison.png" docs/pictures/comparison.png
-cp "$work/bend/comparison.png" "$work/bend.png"
 cp "$work/tunnel/comparison.csv" docs/methods/comparison.csv
+cp "$work/bend/comparison.png" docs/pictures/comparison_bend.png
 cp "$work/bend/comparison.csv" docs/methods/comparison_bend.csv
+cp "$work/curve/comparison.csv" docs/methods/comparison_straightness.csv
+
+# The tables go between their markers in the page.
+for name in tunnel coarse bend curve; do
+    awk -v name="$name" -v table="$work/$name/comparison.md" '
+    $0 == "<!-- table " name " -->" { print; while ((getline row < table) > 0) print row; inside = 1; next }
+    $0 == "<!-- end -->" { inside = 0 }
+    !inside { print }' docs/methods/comparison.md | sed "s|$work/||g" > "$work/page.md"
+    cp "$work/page.md" docs/methods/comparison.md
+done
 
 # Mean stretch over bearing error, one point for each straightness, as SVG.
 awk -F, '
@@ -50,7 +68,7 @@ END {
         relax = name[i] ~ /^relax/
         label = name[i]; sub(/^relax:straightness=/, "", label)
         printf "<circle cx=\"%.1f\" cy=\"%.1f\" r=\"5\" fill=\"%s\"/>", px(x[i]), py(y[i]), relax ? "#2668ac" : "#b8402a"
-        printf "<text x=\"%.1f\" y=\"%.1f\" fill=\"%s\">%s</text>\n", px(x[i]) + 9, py(y[i]) - 6, relax ? "#2668ac" : "#b8402a", label
+        printf "<text x=\"%.1f\" y=\"%.1f\" fill=\"%s\">%s</text>\n", px(x[i]) + 9, py(y[i]) + (relax ? -6 : 18), relax ? "#2668ac" : "#b8402a", label
     }
     print "</svg>"
-}' docs/methods/comparison_bend.csv > docs/pictures/relax_on_a_bend.svg
+}' docs/methods/comparison_straightness.csv > docs/pictures/relax_on_a_bend.svg

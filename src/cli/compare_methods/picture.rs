@@ -13,7 +13,7 @@ use std::path::Path;
 use tiny_skia::{Color, Paint, Pixmap, Rect, Transform};
 
 /// Width of one map at the common scale, pixels.
-const PANEL: f64 = 740.0;
+const PANEL: f64 = 560.0;
 /// Space around the maps, pixels.
 const MARGIN: f64 = 24.0;
 /// Height of the legend and of the captions above each pair of maps, pixels.
@@ -179,7 +179,7 @@ fn text(canvas: &mut Pixmap, words: &str, cap_px: f64, x: f64, y: f64) {
 fn legend(canvas: &mut Pixmap, square: f64, smoothing_m: f64) {
     let right = 2.0 * MARGIN + PANEL;
     text(canvas, &format!("map: squares of {square} m, seen from inside"), 15.0, MARGIN, 34.0);
-    text(canvas, &format!("red: crown; blue: each {} m of chainage", 5.0 * square), 12.0, MARGIN, 66.0);
+    text(canvas, &format!("red: crown, blue: each {} m of chainage", 5.0 * square), 12.0, MARGIN, 66.0);
     let against =
         if smoothing_m > 0.0 { format!(" (surface smoothed over {smoothing_m:.2} m)") } else { String::new() };
     text(canvas, &format!("stretch{against}"), 15.0, right, 34.0);
