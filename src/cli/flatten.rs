@@ -14,7 +14,7 @@ Examples:
   adit flatten runs/drift --in faults.shp --out faults.geojson
 
 Coordinates of the input: those of the scan. On the map the third coordinate is the distance from the surface; what lies
-deep in the rock or beyond a border keeps its way from the surface in the attribute 'off_surface', so that
+deep in the rock or beyond a border keeps its way from the surface in the attribute 'off_surf', so that
 'adit drape' brings it back exactly.";
 
 /// Arguments of `adit flatten`.

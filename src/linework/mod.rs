@@ -17,10 +17,10 @@ pub use route::{Piece, Route, route};
 use crate::numeric::Vec3;
 use serde::{Deserialize, Serialize};
 
-/// Name of the attribute that holds what a map cannot: for vertices that lie in no prism over the surface (deep bolts and
+/// Name of the attribute (Shapefiles cut names at ten characters) that holds what a map cannot: for vertices that lie in no prism over the surface (deep bolts and
 /// boreholes, beyond a border) a list of `[part, vertex, dx, dy, dz]`, the way in scan axes, metres, from the surface
 /// under the vertex to the vertex itself.
-pub const OFF_SURFACE: &str = "off_surface";
+pub const OFF_SURFACE: &str = "off_surf";
 
 /// The value of an attribute.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
