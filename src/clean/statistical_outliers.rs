@@ -15,7 +15,7 @@
 use super::Error;
 use crate::numeric::Vec3;
 use crate::numeric::statistics::median;
-use crate::spatial::nearest::for_each_neighbourhood;
+use crate::spatial::nearest::BundleTree;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -83,36 +83,40 @@ pub fn remove_statistical_outliers(points: &[Vec3], settings: &StatisticalOutlie
         return Verdict { kept: vec![true; points.len()], ratio: f64::INFINITY, sparse_limit_m: f64::INFINITY };
     }
     let k = settings.neighbours;
-    // The point itself is its own nearest neighbour.
-    let found: Vec<(f32, [u32; MOST_NEIGHBOURS])> = for_each_neighbourhood(points, k + 1, |i, neighbours| {
+    // All along the curve of the tree, where neighbours are near in memory. The point itself is its own nearest
+    // neighbour.
+    let tree = BundleTree::new(points);
+    let found: Vec<(f32, [u32; MOST_NEIGHBOURS])> = tree.for_each_place(k + 1, |place, neighbours| {
         let mut sum = 0.0;
         let mut others = [0; MOST_NEIGHBOURS];
-        let all = neighbours.iter().filter(|n| n.index as usize != i).take(k);
+        let all = neighbours.iter().filter(|n| n.index as usize != place).take(k);
         for (other, n) in others.iter_mut().zip(all) {
             *other = n.index;
             sum += n.distance_squared.sqrt();
         }
         ((sum / k as f64) as f32, others)
     });
+    let own: Vec<f32> = found.par_iter().map(|f| f.0).collect();
     let logs: Vec<f64> = found
         .par_iter()
-        .map(|(own, neighbours)| {
-            let mut theirs = [0.0; MOST_NEIGHBOURS];
+        .map(|(own_distance, neighbours)| {
+            let mut theirs = [0.0f32; MOST_NEIGHBOURS];
             for (distance, &n) in theirs.iter_mut().zip(&neighbours[..k]) {
-                *distance = f64::from(found[n as usize].0);
+                *distance = own[n as usize];
             }
-            let typical = median(&mut theirs[..k]).unwrap_or(0.0);
-            if f64::from(*own) <= typical { 0.0 } else { (f64::from(*own) / typical).ln() }
+            theirs[..k].sort_unstable_by(f32::total_cmp);
+            let typical = 0.5 * (f64::from(theirs[(k - 1) / 2]) + f64::from(theirs[k / 2]));
+            let own_distance = f64::from(*own_distance);
+            if own_distance <= typical { 0.0 } else { (own_distance / typical).ln() }
         })
         .collect();
     let ratio = limit(&logs).clamp(settings.min_ratio, settings.max_ratio);
     let log_limit = ratio.ln();
-    let mut distances: Vec<f64> = found.par_iter().map(|f| f64::from(f.0)).collect();
+    let mut distances: Vec<f64> = own.par_iter().map(|&d| f64::from(d)).collect();
     let sparse_limit_m = SPARSE_RATIO * median(&mut distances).unwrap_or(f64::INFINITY);
-    let is_kept = |(log, (own, _)): (&f64, &(f32, [u32; MOST_NEIGHBOURS]))| {
-        *log <= log_limit && f64::from(*own) <= sparse_limit_m
-    };
-    Verdict { kept: logs.par_iter().zip(&found).map(is_kept).collect(), ratio, sparse_limit_m }
+    let is_kept = |(log, own): (&f64, &f32)| *log <= log_limit && f64::from(*own) <= sparse_limit_m;
+    let kept = tree.in_point_order(logs.par_iter().zip(&own).map(is_kept).collect());
+    Verdict { kept, ratio, sparse_limit_m }
 }
 
 fn limit(logs: &[f64]) -> f64 {

@@ -95,6 +95,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         chainage: &uv.iter().map(|p| p.x).collect::<Vec<_>>(),
         girth: &uv.iter().map(|p| p.y).collect::<Vec<_>>(),
         offset: anchors.offsets(),
+        surface_classes: None,
     };
     let partial = partial_name(&arguments.out);
     let written = io::write_points(&cloud, &columns, &partial).map_err(io_failure);

@@ -154,8 +154,14 @@ fn draw_back_map(
     folder.push(".back-map");
     let folder = PathBuf::from(folder);
     fs::create_dir_all(&folder).map_err(|e| cannot(&folder, &e))?;
-    let input =
-        DrawInput { chart: &chart, points: None, frame: &raw.frame, section_offsets_m: None, design_offsets_m: None };
+    let input = DrawInput {
+        chart: &chart,
+        points: None,
+        frame: &raw.frame,
+        section_offsets_m: None,
+        design_offsets_m: None,
+        quality: None,
+    };
     let settings = map::Settings { cell_m: Some(legend.cell_m), layers: layers.to_vec(), ..Default::default() };
     let mut sink = MapFolder::new(&folder);
     map::draw(&input, &settings, &mut sink).map_err(|e| Failure::new(Exit::Resources, e))?;

@@ -4,7 +4,8 @@ use super::{Console, Exit, Failure, Result};
 use crate::cloud::Cloud;
 use crate::io::{self, PointColumns};
 use crate::numeric::Vec3;
-use crate::synthetic::{self, Course, Kind, Recipe, Shape, Surface, SyntheticScan, Truth};
+use crate::segment::Class;
+use crate::synthetic::{self, Course, Kind, Part, Recipe, Shape, Surface, SyntheticScan, Truth, View};
 use std::path::PathBuf;
 
 /// Classes that `--truth` writes: LAS codes where there is one, user codes otherwise.
@@ -18,8 +19,9 @@ Examples:
   adit synth --out long.las --length 200 --stations 16 --points 20000000 --section horseshoe:8.2x6.7
   adit synth --out truth.ply --truth --noise-mm 3                with true class, chainage and girth of every point
 
---truth writes the columns chainage and girth (as measured around the smooth section), offset (relief) and the
-class of each point: 64 wall, 2 floor, 65 furniture, 7 outlier.";
+--truth writes the columns chainage and girth (as measured around the smooth section), offset (relief), the LAS
+classification of each point (64 wall, 2 floor, 65 furniture, 7 outlier) and surface_class, as `adit run` writes what it
+found (0 wall, 1 floor, 2 furniture, 4 noise).";
 
 /// Arguments of `adit synth`.
 #[derive(clap::Args)]
@@ -83,6 +85,15 @@ pub struct Arguments {
     /// Steps of the coordinates in LAS and LAZ, millimetres.
     #[arg(long, value_name = "MM", default_value_t = 1.0)]
     step_mm: f64,
+    /// Part of the section that is there: a half tunnel, or a trench without its roof.
+    #[arg(long, value_enum, default_value_t = PartName::Whole)]
+    part: PartName,
+    /// Share of the surface that is missing, in patches of 1.5 m, 0 to below 1.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    gaps: f64,
+    /// A profile scan: all points lie on profiles this far apart, metres.
+    #[arg(long, value_name = "M")]
+    profiles: Option<f64>,
     /// Same seed, same scan.
     #[arg(long, value_name = "N", default_value_t = Recipe::default().seed)]
     seed: u64,
@@ -104,6 +115,17 @@ enum AlignmentName {
     Helix,
     /// Straight down.
     Shaft,
+}
+
+/// Part of the section.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum PartName {
+    /// All of it.
+    Whole,
+    /// What lies right of the axis.
+    RightHalf,
+    /// Floor and walls without the roof.
+    Trench,
 }
 
 /// What may stand and hang in the tunnel.
@@ -146,6 +168,15 @@ impl Arguments {
             outlier_share: self.outliers,
             colored: !self.no_color,
             origin_in_scan: self.origin,
+            view: View {
+                part: match self.part {
+                    PartName::Whole => Part::Whole,
+                    PartName::RightHalf => Part::RightHalf,
+                    PartName::Trench => Part::Trench,
+                },
+                gap_share: self.gaps,
+                profile_m: self.profiles,
+            },
             seed: self.seed,
         }
     }
@@ -181,11 +212,13 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         // Into the void is positive in files, into the rock in the generator.
         place.map(|(&s, &g)| if g.is_nan() { f64::NAN } else { -tunnel.outward_at(s, g) }).collect::<Vec<f64>>()
     });
+    let surface_classes: Vec<u8> = scan.truth.surface.iter().map(|&s| class_of(s) as u8).collect();
     let columns = relief.as_ref().map(|offset| PointColumns {
         labels: &scan.truth.label,
         chainage: &scan.truth.chainage_m,
         girth: &scan.truth.girth_m,
         offset,
+        surface_classes: Some(&surface_classes),
     });
     let out = &arguments.out;
     let unwritable = |e: std::io::Error| {
@@ -208,6 +241,16 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     }
     console.say(&format!("{} points of a synthetic tunnel in {}", summary.points, out.display()));
     Ok(Exit::Done)
+}
+
+/// The class that segmentation should find.
+fn class_of(surface: Surface) -> Class {
+    match surface {
+        Surface::Wall => Class::Wall,
+        Surface::Floor => Class::Floor,
+        Surface::Furniture => Class::Furniture,
+        Surface::Outlier => Class::Noise,
+    }
 }
 
 /// The scan with the true class of each point as its classification.

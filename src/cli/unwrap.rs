@@ -96,6 +96,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         faces: mesh.faces(),
         observed_vertices: Some(&observed),
         observed_faces: None,
+        quality: None,
     };
     write_whole(&flat, &arguments.out)?;
     let seconds = started.elapsed().as_secs_f64();

@@ -1,8 +1,10 @@
 //! Cutting the tube open: from a [`Mesh`] to a [`Strip`] of disk topology.
 
+mod floor;
 mod seam;
 
-pub use seam::{Settings, Summary, open};
+pub use floor::{FloorSummary, without_floor};
+pub use seam::{FloorChoice, Settings, Summary, open};
 
 use crate::mesh::{Mesh, topology};
 

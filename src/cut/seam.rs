@@ -29,11 +29,24 @@ pub struct Settings {
     /// Angle of the seam around the axis in degrees: 0 at the crown, 90 on the right wall, 180 (the default) at the
     /// invert, -90 on the left wall.
     pub seam_angle_deg: f64,
+    /// Whether the floor stays on the map: `keep`, or `remove` for crown and walls only (fracture maps).
+    pub floor: FloorChoice,
+}
+
+/// What happens to the floor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FloorChoice {
+    /// It stays.
+    #[default]
+    Keep,
+    /// It is cut away along the feet of the walls.
+    Remove,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { seam_angle_deg: 180.0 }
+        Self { seam_angle_deg: 180.0, floor: FloorChoice::Keep }
     }
 }
 
@@ -571,7 +584,8 @@ mod tests {
         let (mesh, axis) = tube(40, 61, everywhere, smooth);
         let area = mesh.area();
         for seam_angle_deg in [180.0, 90.0, -35.0, 0.0] {
-            let (strip, summary) = open(mesh.clone(), &axis, &Settings { seam_angle_deg }).unwrap();
+            let (strip, summary) =
+                open(mesh.clone(), &axis, &Settings { seam_angle_deg, ..Settings::default() }).unwrap();
             assert!((strip.mesh().area() - area).abs() < 1e-9);
             assert!(strip.hole_loops().is_empty() && !summary.already_open);
             assert_eq!(summary.off_line_m, 0.0);

@@ -5,7 +5,7 @@ use super::png::PngWriter;
 use super::tile_pyramid::{self, TilePyramid};
 use super::world_file;
 use crate::map::{
-    Grid, LayerDescription, Legend, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX,
+    Grid, Layer, LayerDescription, Legend, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX,
 };
 use crate::numeric::Vec2;
 use rayon::prelude::*;
@@ -144,7 +144,7 @@ impl MapFolder {
                 world_file::write(&path, &picture_placement)?;
                 picture = Some(PictureRows { writer, width, rows: Vec::new() });
             }
-            if let Look::Labels(classes) = &description.look {
+            if let (Layer::Labels, Look::Labels(classes)) = (description.layer, &description.look) {
                 let path = self.folder.join("labels.json");
                 let file = LabelsFile {
                     cell_m: grid.cell_m(),
@@ -339,6 +339,7 @@ mod tests {
             frame: &frame,
             section_offsets_m: Some(&section),
             design_offsets_m: None,
+            quality: None,
         };
         let settings = Settings { cell_m: Some(0.01), ..Default::default() };
         let mut sink = MapFolder::new(folder.path());

@@ -49,7 +49,7 @@ pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
 pub use package_file::{PackageError, PackageFile};
 pub use placed_points::{PlacedPoint, placed_points};
 pub use scan_date::las_creation_date;
-pub use write::{PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
+pub use write::{NO_CLASS, PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
 
 #[cfg(test)]
 mod tests;

@@ -245,6 +245,7 @@ mod tests {
             frame: &frame,
             section_offsets_m: Some(&section),
             design_offsets_m: None,
+            quality: None,
         };
         let settings = Settings { cell_m: Some(0.01), ..Default::default() };
         draw(&input, &settings, &mut MapFolder::new(folder.path())).unwrap();

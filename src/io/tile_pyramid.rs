@@ -171,6 +171,7 @@ mod tests {
             frame: &frame,
             section_offsets_m: Some(&section),
             design_offsets_m: None,
+            quality: None,
         };
         let settings = Settings { cell_m: Some(0.01), layers: vec![Layer::Offset], tiles: true, ..Default::default() };
         let mut sink = MapFolder::new(folder.path()).with_tiles(settings.tiles);

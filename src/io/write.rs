@@ -20,11 +20,17 @@ pub struct PointColumns<'a> {
     pub girth: &'a [f64],
     /// Distance from the surface along its normal in metres; NaN for points without an anchor.
     pub offset: &'a [f64],
+    /// What the point was taken for (codes of `segment::Class`, [`NO_CLASS`] for none), when that is known.
+    pub surface_classes: Option<&'a [u8]>,
 }
+
+/// The surface class of a point that was not classified.
+pub const NO_CLASS: u8 = u8::MAX;
 
 impl PointColumns<'_> {
     fn check(&self, cloud: &Cloud, destination: &Path) -> Result<(), Error> {
-        let lengths = [self.labels.len(), self.chainage.len(), self.girth.len(), self.offset.len()];
+        let classes = self.surface_classes.map_or(cloud.len(), <[u8]>::len);
+        let lengths = [self.labels.len(), self.chainage.len(), self.girth.len(), self.offset.len(), classes];
         if lengths.iter().all(|&l| l == cloud.len()) {
             return Ok(());
         }
@@ -48,8 +54,8 @@ pub struct WriteSummary {
 ///
 /// LAS and LAZ sources keep version, scale, offset, variable length records, extra bytes and every record bit for bit;
 /// `label` (`u32`), `chainage` (64-bit micrometres), `girth` and `offset` (32-bit micrometres) are appended as named
-/// extra bytes. PLY sources keep all properties and elements, the columns are appended as `uint label` and
-/// `double chainage girth offset` (NaN for none). Columns of these names that a source already has are replaced.
+/// extra bytes, and `surface_class` (`u8`) when the classes are known. PLY sources keep all properties and elements, the columns are appended as `uint label` and
+/// `double chainage girth offset` (NaN for none), `uchar surface_class`. Columns of these names that a source already has are replaced.
 /// Points of other formats are written as LAS 1.4. The destination's extension chooses LAZ, LAS or PLY.
 ///
 /// The file is written in one pass with bounded memory. It is not renamed: give a temporary name and rename it.

@@ -3,13 +3,15 @@
 use super::blend::{self, BlendedTile, Reach, Scatter, Support};
 use super::layer::{
     COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, Layer, LayerDescription, Look, NoData, Resampling, SampleType,
-    Samples, palette,
+    Samples, palette, surface_classes,
 };
 use super::rasterize::{FaceIndex, NO_FACE, SurfaceTile};
 use super::sampling::{ScatterIndex, Spacing};
 use super::{Error, Grid, PixelRect, Ramp, Settings, Summary, automatic_cell_m, relief, roughness};
 use crate::cloud::{Cloud, ScanFrame};
 use crate::numeric::{Vec2, statistics};
+use crate::segment::VertexQuality;
+use crate::segment::quality::NOTHING_SEEN;
 use crate::unwrap::{Chart, distortion};
 use crate::warning::Warning;
 use rayon::prelude::*;
@@ -51,6 +53,8 @@ pub struct DrawInput<'a> {
     pub section_offsets_m: Option<&'a [f64]>,
     /// Signed distance of each vertex of the chart from the design profile in metres, positive inside it.
     pub design_offsets_m: Option<&'a [f64]>,
+    /// How well the surface was measured at each vertex of the chart. Needed by classes, noise, density, incidence.
+    pub quality: Option<&'a VertexQuality>,
 }
 
 /// A finished piece of the map: one column of samples for each layer, in the order of the descriptions.
@@ -148,6 +152,13 @@ impl<'a> Plan<'a> {
         }
         if let Some(found) = input.design_offsets_m.map(<[f64]>::len).filter(|&n| n != vertices) {
             return Err(Error::Length { column: "the distance from the design profile", found, expected: vertices });
+        }
+        if let Some(quality) = input.quality {
+            let incidence = if quality.incidence_deg.is_empty() { vertices } else { quality.incidence_deg.len() };
+            let lengths = [quality.noise_m.len(), quality.density_per_m2.len(), incidence, quality.class.len()];
+            if let Some(found) = lengths.into_iter().find(|&n| n != vertices) {
+                return Err(Error::Length { column: "the quality of the surface", found, expected: vertices });
+            }
         }
         if let Some((cloud, points)) = input.points {
             for (column, found) in [("the place on the map", points.uv.len()), ("the offset", points.offsets_m.len())] {
@@ -371,6 +382,35 @@ impl<'a> Plan<'a> {
                     })
                     .collect(),
             ),
+            Layer::Classes => Samples::U8(
+                (0..pixels)
+                    .map(|i| match self.input.quality {
+                        // Classes do not mix: the one of the nearest corner.
+                        Some(quality) if on_surface(i) => {
+                            let w = surface.weights(i);
+                            let nearest = if w[0] >= w[1] && w[0] >= w[2] {
+                                0
+                            } else if w[1] >= w[2] {
+                                1
+                            } else {
+                                2
+                            };
+                            quality.class[corners(i)[nearest] as usize]
+                        }
+                        _ => NOTHING_SEEN,
+                    })
+                    .collect(),
+            ),
+            Layer::Noise | Layer::Density | Layer::Incidence => {
+                let values = self.input.quality.map_or(&[][..], |q| quality_of(layer, q));
+                let value = |i: usize| {
+                    let w = surface.weights(i);
+                    let blended: f64 = corners(i).iter().zip(w).map(|(&v, w)| f64::from(values[v as usize]) * w).sum();
+                    blended as f32
+                };
+                let known = |i: usize| on_surface(i) && !values.is_empty();
+                Samples::F32((0..pixels).map(|i| if known(i) { value(i) } else { f32::NAN }).collect())
+            }
             Layer::Xyz => {
                 let vertices = self.input.chart.strip().mesh().vertices();
                 let scale = 1.0 / self.input.frame.metres_per_unit;
@@ -497,6 +537,15 @@ fn wanted_layers(input: &DrawInput, settings: &Settings, has_points: bool, warni
         let message = "no map.design_profile is given, so map/design_offset is not drawn";
         leave_out(Layer::DesignOffset, "no-design-profile", message);
     }
+    if input.quality.is_none() {
+        for layer in [Layer::Classes, Layer::Noise, Layer::Density, Layer::Incidence] {
+            let message = format!("there are no scan points, so map/{} is not drawn", layer.name());
+            leave_out(layer, "no-quality", &message);
+        }
+    } else if input.quality.is_some_and(|q| q.incidence_deg.is_empty()) {
+        let message = "no scanner station is known, so map/incidence is not drawn";
+        leave_out(Layer::Incidence, "no-station", message);
+    }
     if input.section_offsets_m.is_none() {
         let message = "the mean section is not known, so map/offset and map/relief are not drawn";
         leave_out(Layer::Offset, "no-mean-section", message);
@@ -506,6 +555,22 @@ fn wanted_layers(input: &DrawInput, settings: &Settings, has_points: bool, warni
         wanted.push(Layer::Relief);
     }
     wanted
+}
+
+/// The values of a quality layer at the vertices.
+fn quality_of(layer: Layer, quality: &VertexQuality) -> &[f32] {
+    match layer {
+        Layer::Noise => &quality.noise_m,
+        Layer::Density => &quality.density_per_m2,
+        _ => &quality.incidence_deg,
+    }
+}
+
+/// The value that 95 % of the vertices stay below, on the series 1, 2, 5.
+fn quality_range(layer: Layer, input: &DrawInput) -> f64 {
+    let values = input.quality.map_or(&[][..], |q| quality_of(layer, q));
+    let mut known: Vec<f64> = values.iter().map(|&v| f64::from(v)).filter(|v| v.is_finite()).collect();
+    super::grid::next_in_series(statistics::quantile(&mut known, 0.95).unwrap_or(1.0).max(1e-4))
 }
 
 /// s1, s2, area ratio and direction (degrees) of a face.
@@ -599,6 +664,27 @@ fn describe(
             let look = Look::Grey { low: 1.0, high: 255.0 };
             let meaning = "shaded relief of the offset from the mean section, lit from the upper left";
             of(S::U8, &["relief"], N::Value(0.0), R::Mean, look, "", meaning)
+        }
+        Layer::Classes => {
+            let meaning = "what was seen first: 0 wall, 1 floor, 2 furniture that hides the wall, 255 nothing";
+            of(
+                S::U8,
+                &["class"],
+                N::Value(f64::from(NOTHING_SEEN)),
+                R::Nearest,
+                Look::Labels(surface_classes()),
+                "",
+                meaning,
+            )
+        }
+        Layer::Noise | Layer::Density | Layer::Incidence => {
+            let look = Look::Ramp { ramp: Ramp::Heat, low: 0.0, high: quality_range(layer, input) };
+            let (unit, meaning) = match layer {
+                Layer::Noise => ("m", "root mean square scatter of the points about their local plane"),
+                Layer::Density => ("1/m2", "scan points on a square metre of the mean section"),
+                _ => ("deg", "angle between the line of sight and the normal of the surface"),
+            };
+            of(S::F32, &[layer.name()], N::Nan, R::Mean, look, unit, meaning)
         }
         Layer::Xyz => {
             let meaning = "position on the surface in scan coordinates: sample + offset of the band";
@@ -705,15 +791,23 @@ mod tests {
         offsets_m[0] = 2.0;
         let section: Vec<f64> = chart.uv().iter().map(|p| 0.01 * p.x).collect();
         let frame = ScanFrame::with_origin(Vec3::new(500_000.0, 6_000_000.0, 0.0));
+        let quality = VertexQuality {
+            noise_m: chart.uv().iter().map(|p| 0.001 * p.x as f32).collect(),
+            density_per_m2: chart.uv().iter().map(|p| 100.0 * p.y as f32).collect(),
+            incidence_deg: chart.uv().iter().map(|p| p.x as f32).collect(),
+            class: chart.uv().iter().map(|p| u8::from(p.x > 6.1) * 2).collect(),
+        };
         let input = DrawInput {
             chart: &chart,
             points: Some((&cloud, PointsOnMap { uv: &uv, offsets_m: &offsets_m })),
             frame: &frame,
             section_offsets_m: Some(&section),
             design_offsets_m: Some(&section),
+            quality: Some(&quality),
         };
         let mut layers = Settings::default().layers;
         layers.extend([Layer::Relief, Layer::Xyz, Layer::SurfacePoint, Layer::DesignOffset, Layer::Roughness]);
+        layers.extend([Layer::Classes, Layer::Noise, Layer::Density, Layer::Incidence]);
         let settings = Settings { cell_m: Some(0.02), layers, roughness_window_m: 1.6, ..Default::default() };
         let mut sink = InMemory::default();
         let summary = draw(&input, &settings, &mut sink).unwrap();
@@ -739,6 +833,10 @@ mod tests {
             assert!((layer(Layer::DesignOffset).1[i] - 0.01 * uv.x).abs() < OFFSET_STEP_M);
             assert!(layer(Layer::Roughness).1[i] < 1e-5);
             assert_eq!(layer(Layer::Coverage).1[i], 1.0);
+            assert!((layer(Layer::Noise).1[i] - 0.001 * uv.x).abs() < 1e-6);
+            assert!((layer(Layer::Density).1[i] - 100.0 * uv.y).abs() < 1e-3);
+            assert!((layer(Layer::Incidence).1[i] - uv.x).abs() < 1e-4);
+            assert_eq!(layer(Layer::Classes).1[i], if uv.x > 6.1 { 2.0 } else { 0.0 });
             let stretch = &layer(Layer::Distortion).1[4 * i..4 * i + 4];
             assert!((stretch[0] - 1.0).abs() < 0.01 && (stretch[1] - 1.0).abs() < 0.01);
             let (description, xyz) = layer(Layer::Xyz);
@@ -760,6 +858,7 @@ mod tests {
             frame: &ScanFrame::local(),
             section_offsets_m: None,
             design_offsets_m: None,
+            quality: None,
         };
         let mut sink = InMemory::default();
         let summary = draw(&input, &Settings::default(), &mut sink).unwrap();
@@ -776,6 +875,7 @@ mod tests {
             frame: &ScanFrame::local(),
             section_offsets_m: Some(&[0.0]),
             design_offsets_m: None,
+            quality: None,
         };
         let error = draw(&input, &Settings::default(), &mut InMemory::default()).unwrap_err();
         assert!(matches!(error, Error::Length { found: 1, .. }));

@@ -23,6 +23,14 @@ pub enum Layer {
     Distortion,
     /// Shaded relief of the offset, lit from the upper left.
     Relief,
+    /// What was seen at a place first: wall, floor, or furniture that hides it.
+    Classes,
+    /// Scatter of the points about their local plane in metres.
+    Noise,
+    /// Scan points a square metre.
+    Density,
+    /// Angle between the line of sight and the normal in degrees; only when the scanner stations are known.
+    Incidence,
     /// Position of each pixel on the surface in scan coordinates (offset of each band in the metadata).
     Xyz,
     /// Face and barycentric weights (second and third corner) of each pixel in `chart.ply`.
@@ -44,6 +52,10 @@ impl Layer {
             Layer::Coverage => "coverage",
             Layer::Distortion => "distortion",
             Layer::Relief => "relief",
+            Layer::Classes => "classes",
+            Layer::Noise => "noise",
+            Layer::Density => "density",
+            Layer::Incidence => "incidence",
             Layer::Xyz => "xyz",
             Layer::SurfacePoint => "surface_point",
             Layer::DesignOffset => "design_offset",
@@ -299,6 +311,15 @@ impl Look {
                 .collect(),
         }
     }
+}
+
+/// The classes of [`Layer::Classes`] with their colours.
+pub fn surface_classes() -> Vec<PaletteEntry> {
+    [("wall", [176, 166, 150]), ("floor", [120, 149, 178]), ("furniture", [222, 118, 62])]
+        .into_iter()
+        .enumerate()
+        .map(|(value, (name, color))| PaletteEntry { value: value as Label, name: name.into(), color })
+        .collect()
 }
 
 /// Squared distance of two colours.

@@ -21,7 +21,8 @@ use crate::clean::{GeometryCloud, Spacing};
 use crate::cloud::Cloud;
 use crate::numeric::Vec3;
 use crate::numeric::statistics::{median, quantile};
-use crate::spatial::nearest::for_each_neighbourhood;
+use crate::spatial::Neighbour;
+use crate::spatial::nearest::BundleTree;
 use crate::warning::Warning;
 use plane_fit::{Plane, Scatter};
 use rayon::prelude::*;
@@ -29,9 +30,11 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Neighbourhoods tried in turn, the point included.
-const NEIGHBOURHOODS: [usize; 3] = [10, 18, 32];
+const NEIGHBOURHOODS: &[usize] = &[14, 28];
 /// The same for a scan whose noise is not small against its spacing.
-const NOISY_NEIGHBOURHOODS: [usize; 3] = [18, 32, 64];
+const NOISY_NEIGHBOURHOODS: &[usize] = &[18, 32, 64];
+/// Points whose noise decides between the two.
+const NOISE_SAMPLE: usize = 8000;
 /// Noise over spacing from which a scan is noisy in that sense.
 const NOISY: f64 = 0.25;
 /// A larger neighbourhood may scatter more about its plane than the one before by this many standard errors of the
@@ -44,8 +47,8 @@ const LINE: f64 = 0.02;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Number of nearest neighbours (the point included) for each plane, 4 to 128. Follows noise and edges from 10 to
-    /// 32, or 18 to 64 in noisy scans, when not given.
+    /// Number of nearest neighbours (the point included) for each plane, 4 to 128. 14 or 28
+    /// by noise and edges, or 18 to 64 in noisy scans, when not given.
     pub neighbours: Option<usize>,
     /// Whether known scanner stations decide which side faces the void (else only the axis does).
     pub use_stations: bool,
@@ -122,7 +125,7 @@ impl<'a> Viewpoints<'a> {
     }
 
     /// Position of the station that saw scan point `index`.
-    fn of_point(&self, index: usize) -> Option<Vec3> {
+    pub fn of_point(&self, index: usize) -> Option<Vec3> {
         let station = *self.station_of_point.get(index)?;
         Some(self.stations.get(station as usize)?.position_in_local)
     }
@@ -199,7 +202,7 @@ impl OrientedCloud {
 }
 
 /// What is known of the surface at one point.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 struct Estimate {
     normal: Vec3,
     denoised: Vec3,
@@ -230,7 +233,7 @@ pub fn estimate(
     let estimates = if profiles {
         profiles::estimate(points, axis, &geometry.spacing(), settings.neighbours)
     } else {
-        planes(points, geometry.spacing().along_m, settings.neighbours)
+        planes(points, settings.neighbours)
     };
     let mut normals: Vec<Vec3> = estimates.par_iter().map(|e| e.normal).collect();
     let viewpoints = if settings.use_stations { viewpoints } else { Viewpoints::unknown() };
@@ -278,46 +281,62 @@ pub fn estimate(
 
 /// Unoriented normals of any points, each from the plane of its `neighbours` nearest points (itself included).
 pub fn unoriented(points: &[Vec3], neighbours: usize) -> Vec<Vec3> {
-    for_each_neighbourhood(points, neighbours, |i, found| {
-        let mut scatter = Scatter::about(points[i]);
-        found.iter().for_each(|n| scatter.add(&points[n.index as usize]));
-        scatter.plane().map_or(Vec3::z(), |p| p.normal)
-    })
+    normals_of_sizes(&BundleTree::new(points), &[neighbours])
 }
 
-fn planes(points: &[Vec3], spacing_m: f64, neighbours: Option<usize>) -> Vec<Estimate> {
-    if let Some(k) = neighbours {
-        return planes_of(points, &[k]);
-    }
-    let estimates = planes_of(points, &NEIGHBOURHOODS);
-    let mut noises: Vec<f64> = estimates.iter().map(|e| f64::from(e.noise_m)).collect();
-    let noisy = median(&mut noises).is_some_and(|noise| noise > NOISY * spacing_m);
-    if noisy { planes_of(points, &NOISY_NEIGHBOURHOODS) } else { estimates }
+/// Unoriented normals of any points, each from as many neighbours as noise and edges allow (see the module's header).
+pub fn adaptive(points: &[Vec3]) -> Vec<Vec3> {
+    let tree = BundleTree::new(points);
+    let sizes = neighbourhoods(&tree);
+    normals_of_sizes(&tree, sizes)
 }
 
-/// Planes over the largest of the given neighbourhoods that is still flat.
-fn planes_of(points: &[Vec3], sizes: &[usize]) -> Vec<Estimate> {
-    let most = sizes[sizes.len() - 1];
-    for_each_neighbourhood(points, most, |i, found| {
-        let mut scatter = Scatter::about(points[i]);
-        let mut chosen: Option<(Plane, usize)> = None;
-        let mut taken = 0;
-        for &size in sizes {
-            let until = size.min(found.len());
-            found[taken..until].iter().for_each(|n| scatter.add(&points[n.index as usize]));
-            taken = until;
-            let Some(plane) = scatter.plane() else { break };
-            let grows = chosen.is_none_or(|(before, count)| {
-                let error = (2.0 * (count as f64 - 3.0).max(1.0)).sqrt().recip();
-                before.roundness < LINE || plane.noise_m <= (1.0 + MORE_SCATTER_ERRORS * error) * before.noise_m
-            });
-            if !grows {
-                break;
-            }
-            chosen = Some((plane, taken));
+fn normals_of_sizes(tree: &BundleTree, sizes: &[usize]) -> Vec<Vec3> {
+    let normal =
+        |place: usize, found: &[Neighbour]| plane_of(tree, place, found, sizes).map_or(Vec3::z(), |p| p.0.normal);
+    tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], normal))
+}
+
+fn planes(points: &[Vec3], neighbours: Option<usize>) -> Vec<Estimate> {
+    let tree = BundleTree::new(points);
+    let sizes = neighbours.map_or_else(|| neighbourhoods(&tree).to_vec(), |k| vec![k]);
+    let estimate =
+        |place: usize, found: &[Neighbour]| from_plane(tree.point(place), plane_of(&tree, place, found, &sizes));
+    tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], estimate))
+}
+
+/// The neighbourhoods to try, by the noise and the spacing of a sample of the points.
+fn neighbourhoods(tree: &BundleTree) -> &'static [usize] {
+    let sample = tree.for_sample(NOISE_SAMPLE, NEIGHBOURHOODS[NEIGHBOURHOODS.len() - 1], |place, found| {
+        let noise_m = plane_of(tree, place, found, NEIGHBOURHOODS).map_or(0.0, |(plane, _)| plane.noise_m);
+        (noise_m, found.get(1).map_or(0.0, |n| n.distance_squared.sqrt()))
+    });
+    let (mut noises, mut spacings): (Vec<f64>, Vec<f64>) = sample.into_iter().unzip();
+    let noisy = median(&mut noises).unwrap_or(0.0) > NOISY * median(&mut spacings).unwrap_or(0.0);
+    if noisy { NOISY_NEIGHBOURHOODS } else { NEIGHBOURHOODS }
+}
+
+/// The plane over the largest of the given neighbourhoods that is still flat, and how many points that is. Neighbours
+/// are places of the tree.
+fn plane_of(tree: &BundleTree, place: usize, found: &[Neighbour], sizes: &[usize]) -> Option<(Plane, usize)> {
+    let mut scatter = Scatter::about(tree.point(place));
+    let mut chosen: Option<(Plane, usize)> = None;
+    let mut taken = 0;
+    for &size in sizes {
+        let until = size.min(found.len());
+        found[taken..until].iter().for_each(|n| scatter.add(&tree.point(n.index as usize)));
+        taken = until;
+        let Some(plane) = scatter.plane() else { break };
+        let grows = chosen.is_none_or(|(before, count)| {
+            let error = (2.0 * (count as f64 - 3.0).max(1.0)).sqrt().recip();
+            before.roundness < LINE || plane.noise_m <= (1.0 + MORE_SCATTER_ERRORS * error) * before.noise_m
+        });
+        if !grows {
+            break;
         }
-        from_plane(points[i], chosen)
-    })
+        chosen = Some((plane, taken));
+    }
+    chosen
 }
 
 fn from_plane(point: Vec3, chosen: Option<(Plane, usize)>) -> Estimate {

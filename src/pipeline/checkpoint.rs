@@ -8,7 +8,7 @@ use crate::axis::Axis;
 use crate::cut::Strip;
 use crate::mesh::Mesh;
 use crate::numeric::{Vec2, Vec3};
-use crate::segment::SectionField;
+use crate::segment::{Floor, Quality, SectionField};
 use bytemuck::Pod;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -209,6 +209,39 @@ impl Checkpoint for SectionField {
         let observed = columns.get::<u8>("section observed")?.into_iter().map(|o| o != 0).collect();
         SectionField::from_columns(start, step, columns.get("section radius")?, observed)
             .ok_or_else(|| columns.damaged("the section does not fit together"))
+    }
+}
+
+impl Checkpoint for Quality {
+    fn save(&self, columns: &mut Writer) {
+        let (lengths, size, [noise, density, incidence], class) = self.columns();
+        columns.put("quality start and cell", &[lengths]);
+        columns.put("quality rows and columns", &[size]);
+        columns.put("quality noise", noise);
+        columns.put("quality density", density);
+        columns.put("quality incidence", incidence);
+        columns.put("quality class", class);
+    }
+
+    fn load(columns: &Reader) -> Result<Self, Error> {
+        let values =
+            [columns.get("quality noise")?, columns.get("quality density")?, columns.get("quality incidence")?];
+        let (lengths, size) = (columns.one("quality start and cell")?, columns.one("quality rows and columns")?);
+        Quality::from_columns(lengths, size, values, columns.get("quality class")?)
+            .ok_or_else(|| columns.damaged("the quality does not fit together"))
+    }
+}
+
+impl Checkpoint for Floor {
+    fn save(&self, columns: &mut Writer) {
+        let (start_and_window, feet) = self.columns();
+        columns.put("floor start and window", &[start_and_window]);
+        columns.put("floor feet", feet);
+    }
+
+    fn load(columns: &Reader) -> Result<Self, Error> {
+        Floor::from_columns(columns.one("floor start and window")?, columns.get("floor feet")?)
+            .ok_or_else(|| columns.damaged("the floor does not fit together"))
     }
 }
 

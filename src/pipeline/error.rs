@@ -1,7 +1,7 @@
 //! What keeps a run from finishing: which stage, what happened there, and whose problem it is.
 
 use super::{checkpoint, preflight, run_folder, settings};
-use crate::{axis, clean, cut, io, map, mesh, segment, unwrap};
+use crate::{axis, clean, cut, io, map, mesh, normals, segment, unwrap};
 
 /// Whose problem an error is; the command line turns it into an exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -122,9 +122,21 @@ impl StageError for axis::Error {
     }
 }
 
+impl StageError for normals::Error {
+    fn kind(&self) -> Kind {
+        match self {
+            normals::Error::Neighbours { .. } => Kind::Usage,
+            _ => Kind::BadInput,
+        }
+    }
+}
+
 impl StageError for segment::Error {
     fn kind(&self) -> Kind {
-        Kind::BadInput
+        match self {
+            segment::Error::CodeTwice { .. } => Kind::Usage,
+            _ => Kind::BadInput,
+        }
     }
 }
 

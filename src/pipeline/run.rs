@@ -13,13 +13,15 @@ use super::report;
 use super::run_folder::{RunFolder, sha256_of, sha256_of_all};
 use super::settings::Pipeline;
 use crate::axis::{self, Axis, AxisCoordinates};
-use crate::cloud::ScanFrame;
+use crate::clean::{DROPPED, GeometryCloud};
+use crate::cloud::{Cloud, ScanFrame};
 use crate::io::ply::{PlyMesh, write_mesh};
 use crate::linework::{self, FlattenSettings};
 use crate::mesh::anchor;
 use crate::mesh::{self, FaceId, Mesh};
+use crate::normals::{self, OrientedCloud, Viewpoints};
 use crate::numeric::{Vec2, Vec3};
-use crate::segment::{self, SectionField};
+use crate::segment::{self, Class, Floor, Quality, SectionField, Segmentation, VertexQuality};
 use crate::unwrap::{self, Chart};
 use crate::warning::Warning;
 use crate::{clean, cut, io, map};
@@ -36,13 +38,14 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "clean", version: 1, needs: &["ingest"] },
     Stage { name: "axis", version: 1, needs: &["clean"] },
-    Stage { name: "segment", version: 1, needs: &["clean", "axis"] },
-    Stage { name: "mesh", version: 2, needs: &["segment", "axis"] },
+    Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "segment", version: 2, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "mesh", version: 3, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
-    Stage { name: "map", version: 2, needs: &["anchor", "unwrap", "mesh", "ingest"] },
-    Stage { name: "points", version: 1, needs: &["anchor", "ingest"] },
+    Stage { name: "map", version: 3, needs: &["anchor", "unwrap", "mesh", "ingest"] },
+    Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
 ];
 
@@ -71,12 +74,22 @@ pub struct Outcome {
     pub worked: bool,
 }
 
-/// The surface and the mean section that it deviates from.
+/// The surface, the mean section that it deviates from, and what the points told about both.
 struct Surface {
     mesh: Mesh,
     section: SectionField,
     /// Where the walls meet the floor; empty without a floor.
     feet: Vec<map::Feet>,
+    floor: Option<Floor>,
+    /// `None` when the run started from a mesh.
+    points: Option<SurfacePoints>,
+}
+
+/// What the points of a scan told about the surface.
+struct SurfacePoints {
+    quality: Quality,
+    /// The class of each scan point.
+    class_of_point: Vec<u8>,
 }
 
 /// What a run is allowed and asked to do besides what its pipeline says. None of it changes a product.
@@ -288,34 +301,52 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         write_text("axis", &staging.join("axis.csv"), &axis_csv(&result.0, &frame))?;
         Ok(result)
     });
+    let oriented = line.passing("normals", |_| {
+        let (cloud, cleaned) = (cloud.get()?, cleaned.get()?);
+        let viewpoints = Viewpoints::of(&cloud);
+        done("normals", normals::estimate(&cleaned, &*axis.get()?, viewpoints, &pipeline.normals))
+    });
     let segmentation = line.passing("segment", |_| {
-        let axis = axis.get()?;
-        done("segment", segment::classify_positions(cleaned.get()?.positions(), &axis, &pipeline.segment))
+        let (cloud, cleaned, axis) = (cloud.get()?, cleaned.get()?, axis.get()?);
+        let cleaned: &GeometryCloud = &cleaned;
+        let table = pipeline.segment.from_classification.table().map_err(Error::in_stage("segment"))?;
+        let codes = cloud.attributes().classifications.as_deref();
+        let given = |i: usize| codes.and_then(|codes| table[codes[cleaned.first_points()[i] as usize] as usize]);
+        done("segment", segment::classify(cleaned.positions(), given, &axis, &pipeline.segment))
     });
     let surface = line.product("mesh", |staging| {
-        let segmentation = segmentation.get()?;
+        let (segmentation, axis) = (segmentation.get()?, axis.get()?);
+        let points = surface_points(&*cloud.get()?, &*cleaned.get()?, &*oriented.get()?, &segmentation);
+        oriented.release();
         cleaned.release();
-        let axis = axis.get()?;
         let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
-        write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None)?;
+        let quality = points.quality.at(&segmentation.section, &axis, mesh.vertices());
+        write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None, Some(&quality))?;
         let feet = feet(&segmentation);
-        Ok((Surface { mesh, section: segmentation.section.clone(), feet }, summary))
+        let (section, floor) = (segmentation.section.clone(), segmentation.floor.clone());
+        Ok((Surface { mesh, section, feet, floor, points: Some(points) }, summary))
     });
     if until == Until::Surface {
         axis.ensure()?;
         return surface.ensure();
     }
     let strip = line.passing("cut", |_| {
-        let mesh = surface.get()?.mesh.clone();
         segmentation.release();
-        done("cut", cut::open(mesh, &*axis.get()?, &pipeline.cut))
+        open_surface(pipeline, &*surface.get()?, &*axis.get()?)
     });
     let chart = line.product("unwrap", |staging| {
         let axis = axis.get()?;
         let handles = read_handles(pipeline, cloud.get()?.frame())?;
         let (chart, summary) =
             done("unwrap", unwrap::flatten_with_handles(strip.take()?, Some(&axis), &handles, &pipeline.unwrap))?;
-        write_ply("unwrap", &staging.join("chart.ply"), cloud.get()?.frame(), chart.strip().mesh(), Some(chart.uv()))?;
+        write_ply(
+            "unwrap",
+            &staging.join("chart.ply"),
+            cloud.get()?.frame(),
+            chart.strip().mesh(),
+            Some(chart.uv()),
+            None,
+        )?;
         Ok((chart, summary))
     });
     let placed = line.product("anchor", |_| {
@@ -336,23 +367,27 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         let placed = placed.get()?;
         let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
         let around = around_the_axis(pipeline, &chart, places, &axis, &surface)?;
+        let vertices = chart.strip().mesh().vertices();
+        let quality = surface.points.as_ref().map(|p| p.quality.at(&surface.section, &axis, vertices));
         let input = map::DrawInput {
             chart: &chart,
             points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
             frame: cloud.frame(),
             section_offsets_m: Some(&around.section_offsets_m),
             design_offsets_m: around.design_offsets_m.as_deref(),
+            quality: quality.as_ref(),
         };
         draw_map(pipeline, &input, &around.lines, staging)
     });
     let points = line.passing("points", |staging| {
-        let (cloud, placed) = (cloud.get()?, placed.get()?);
+        let (cloud, placed, surface) = (cloud.get()?, placed.get()?, surface.get()?);
         let labels = cloud.attributes().labels.clone().unwrap_or_else(|| vec![0; cloud.len()]);
         let columns = io::PointColumns {
             labels: &labels,
             chainage: &placed.uv.iter().map(|p| p.x).collect::<Vec<_>>(),
             girth: &placed.uv.iter().map(|p| p.y).collect::<Vec<_>>(),
             offset: &placed.offsets_m,
+            surface_classes: surface.points.as_ref().map(|p| &p.class_of_point[..]),
         };
         let written = io::write_points(&cloud, &columns, &staging.join(points_file(&pipeline.input)));
         done("points", written.map(|summary| ((), summary)))
@@ -400,7 +435,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
         let coordinates: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
         let section = SectionField::estimate(&coordinates, 0.0)
             .map_err(|error| Error::in_stage("mesh")(segment::Error::from(error)))?;
-        write_ply("mesh", &staging.join("mesh.ply"), &raw.frame, &mesh, None)?;
+        write_ply("mesh", &staging.join("mesh.ply"), &raw.frame, &mesh, None, None)?;
         let filled_m2: f64 = (0..mesh.faces().len())
             .filter(|&f| !mesh.observed()[f])
             .map(|f| mesh.double_area_vector(f as FaceId).norm() / 2.0)
@@ -409,16 +444,22 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
             "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
             "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
         });
-        Ok((Surface { mesh, section, feet: vec![] }, summary))
+        Ok((Surface { mesh, section, feet: vec![], floor: None, points: None }, summary))
     });
-    let strip =
-        line.passing("cut", |_| done("cut", cut::open(surface.get()?.mesh.clone(), &*axis.get()?, &pipeline.cut)));
+    let strip = line.passing("cut", |_| open_surface(pipeline, &*surface.get()?, &*axis.get()?));
     let chart = line.product("unwrap", |staging| {
         let axis = axis.get()?;
         let handles = read_handles(pipeline, &raw.get()?.frame)?;
         let (chart, summary) =
             done("unwrap", unwrap::flatten_with_handles(strip.take()?, Some(&axis), &handles, &pipeline.unwrap))?;
-        write_ply("unwrap", &staging.join("chart.ply"), &raw.get()?.frame, chart.strip().mesh(), Some(chart.uv()))?;
+        write_ply(
+            "unwrap",
+            &staging.join("chart.ply"),
+            &raw.get()?.frame,
+            chart.strip().mesh(),
+            Some(chart.uv()),
+            None,
+        )?;
         Ok((chart, summary))
     });
     let map = line.passing("map", |staging| {
@@ -432,6 +473,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
             frame: &frame,
             section_offsets_m: Some(&around.section_offsets_m),
             design_offsets_m: around.design_offsets_m.as_deref(),
+            quality: None,
         };
         draw_map(pipeline, &input, &around.lines, staging)
     });
@@ -452,6 +494,43 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
     chart.ensure()?;
     map.ensure()?;
     profile.ensure()
+}
+
+/// The surface cut open, without its floor if that is wished.
+fn open_surface(pipeline: &Pipeline, surface: &Surface, axis: &Axis) -> Result<(cut::Strip, serde_json::Value), Error> {
+    let mesh = surface.mesh.clone();
+    if pipeline.cut.floor == cut::FloorChoice::Keep {
+        return done("cut", cut::open(mesh, axis, &pipeline.cut));
+    }
+    let Some(floor) = &surface.floor else {
+        let message = "cut.floor = \"remove\", but no level floor was found: nothing is removed";
+        let (strip, mut summary) = done("cut", cut::open(mesh, axis, &pipeline.cut))?;
+        if let Some(warnings) = summary["warnings"].as_array_mut() {
+            warnings.push(json!(Warning::new("no-floor", message)));
+        }
+        return Ok((strip, summary));
+    };
+    let (mesh, removed) = cut::without_floor(mesh, axis, &surface.section, floor).map_err(Error::in_stage("cut"))?;
+    let (strip, mut summary) = done("cut", cut::open(mesh, axis, &pipeline.cut))?;
+    summary["floor"] = json!(removed);
+    Ok((strip, summary))
+}
+
+/// Quality of the surface and class of each scan point.
+fn surface_points(
+    cloud: &Cloud,
+    cleaned: &GeometryCloud,
+    oriented: &OrientedCloud,
+    segmentation: &Segmentation,
+) -> SurfacePoints {
+    let viewpoints = Viewpoints::of(cloud);
+    let station = |i: usize| viewpoints.of_point(cleaned.first_points()[i] as usize);
+    let class_of_point = cleaned
+        .geometry_of_point()
+        .par_iter()
+        .map(|&g| if g == DROPPED { Class::Noise } else { segmentation.class[g as usize] } as u8)
+        .collect();
+    SurfacePoints { quality: Quality::of(oriented, segmentation, cleaned.counts(), station), class_of_point }
 }
 
 /// Traces the axis, or reads the alignment that the settings name.
@@ -552,10 +631,28 @@ impl Checkpoint for Surface {
         self.mesh.save(columns);
         self.section.save(columns);
         columns.put("feet", &self.feet);
+        columns.put("has floor and points", &[[u8::from(self.floor.is_some()), u8::from(self.points.is_some())]]);
+        if let Some(floor) = &self.floor {
+            floor.save(columns);
+        }
+        if let Some(points) = &self.points {
+            points.quality.save(columns);
+            columns.put("class of point", &points.class_of_point);
+        }
     }
 
     fn load(columns: &checkpoint::Reader) -> Result<Self, checkpoint::Error> {
-        Ok(Self { mesh: Mesh::load(columns)?, section: SectionField::load(columns)?, feet: columns.get("feet")? })
+        let [has_floor, has_points] = columns.one::<[u8; 2]>("has floor and points")?;
+        let points = || -> Result<SurfacePoints, checkpoint::Error> {
+            Ok(SurfacePoints { quality: Quality::load(columns)?, class_of_point: columns.get("class of point")? })
+        };
+        Ok(Self {
+            mesh: Mesh::load(columns)?,
+            section: SectionField::load(columns)?,
+            feet: columns.get("feet")?,
+            floor: (has_floor != 0).then(|| Floor::load(columns)).transpose()?,
+            points: (has_points != 0).then(points).transpose()?,
+        })
     }
 }
 
@@ -704,6 +801,7 @@ fn write_ply(
     frame: &ScanFrame,
     mesh: &Mesh,
     uv: Option<&[Vec2]>,
+    quality: Option<&VertexQuality>,
 ) -> Result<(), Error> {
     let observed = mesh.observed_vertices();
     let ply = PlyMesh {
@@ -713,6 +811,7 @@ fn write_ply(
         faces: mesh.faces(),
         observed_vertices: Some(&observed),
         observed_faces: Some(mesh.observed()),
+        quality,
     };
     write_mesh(&ply, path).map_err(Error::in_stage(stage))
 }

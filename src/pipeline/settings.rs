@@ -6,7 +6,7 @@
 use super::known_keys::KnownKeys;
 use super::limits::Limits;
 use super::profile;
-use crate::{axis, clean, cut, io, map, mesh, segment, unwrap};
+use crate::{axis, clean, cut, io, map, mesh, normals, segment, unwrap};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::path::{Path, PathBuf};
@@ -25,6 +25,8 @@ pub struct Pipeline {
     pub clean: clean::Settings,
     /// Finding the tunnel's axis.
     pub axis: axis::Settings,
+    /// Which way the surface faces, and how noisy it is.
+    pub normals: normals::Settings,
     /// Telling wall and floor from everything else.
     pub segment: segment::Settings,
     /// Making the surface.

@@ -42,6 +42,16 @@ impl Floor {
         [a[0] * (1.0 - t) + b[0] * t, a[1] * (1.0 - t) + b[1] * t]
     }
 
+    /// What makes the same floor again with [`Self::from_columns`]: first chainage, window length, feet, metres.
+    pub fn columns(&self) -> ([f64; 2], &[[f64; 2]]) {
+        ([self.start, self.window], &self.feet)
+    }
+
+    /// A floor from what [`Self::columns`] gave; `None` without feet.
+    pub fn from_columns([start, window]: [f64; 2], feet: Vec<[f64; 2]>) -> Option<Self> {
+        (!feet.is_empty() && window > 0.0).then_some(Self { start, window, feet })
+    }
+
     /// The same feet in the girth of another mean section around the same axis.
     pub(super) fn on(mut self, from: &SectionField, to: &SectionField) -> Self {
         for (k, feet) in self.feet.iter_mut().enumerate() {
@@ -157,7 +167,53 @@ fn feet_of_window(
         return None;
     }
     let step = (right - left) / columns as f64;
-    Some([left + a as f64 * step, right - b as f64 * step])
+    let coarse = [left + a as f64 * step, right - b as f64 * step];
+    // Where the line of the floor meets the line of the wall: finer than a cell, and the corner of the mean section is
+    // rounded.
+    let corner = |side: usize| -> Option<f64> {
+        let column = |k: usize| if side == 0 { k } else { columns - 1 - k };
+        let reach = if side == 0 { a } else { b };
+        let middle = mx + 0.5 * if side == 0 { low - mx } else { high - mx };
+        let beside: Vec<[f64; 2]> = (0..reach.saturating_sub((CORNER_M / step) as usize))
+            .filter_map(|k| profile[column(k)].map(|p| [p[0], p[1]]))
+            .filter(|p| (p[0] - middle).abs() <= 0.5 * (high - low))
+            .collect();
+        let floor_line = line(&beside)?;
+        let above = |p: &[f64; 3]| p[1] - (floor_line[0] + floor_line[1] * p[0]);
+        let wall: Vec<[f64; 2]> = (reach.saturating_sub(2)..columns / 2)
+            .filter_map(|k| profile[column(k)])
+            .take_while(|p| above(p) <= FOOT_WALL_M[1])
+            .filter(|p| above(p) >= FOOT_WALL_M[0])
+            .map(|p| [p[1], p[0]])
+            .collect();
+        let wall_line = line(&wall)?;
+        // up = f0 + f1 x, x = w0 + w1 up
+        let divisor = 1.0 - floor_line[1] * wall_line[1];
+        let x = (wall_line[0] + wall_line[1] * floor_line[0]) / divisor;
+        let up = floor_line[0] + floor_line[1] * x;
+        let near = (divisor.abs() > 0.2).then(|| section.girth(chainage, x.atan2(up)))?;
+        ((near - coarse[side]).abs() <= FURTHEST_CORRECTION_M).then_some(near)
+    };
+    Some([0, 1].map(|side| corner(side).unwrap_or(coarse[side])))
+}
+
+/// The floor's line is taken from what lies farther than this from the coarse foot, metres.
+const CORNER_M: f64 = 0.2;
+/// The wall's line is taken from what lies between these heights over the floor, metres.
+const FOOT_WALL_M: [f64; 2] = [0.08, 0.6];
+/// A corner farther than this from the coarse foot is not that of wall and floor, metres.
+const FURTHEST_CORRECTION_M: f64 = 0.35;
+
+/// The line `y = l0 + l1 x` of least squares through points (x, y); `None` for fewer than three, or all at one x.
+fn line(points: &[[f64; 2]]) -> Option<[f64; 2]> {
+    let n = points.len() as f64;
+    if points.len() < 3 {
+        return None;
+    }
+    let (mx, my) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p[0] / n, y + p[1] / n));
+    let (sxx, sxy) =
+        points.iter().fold((0.0, 0.0), |(xx, xy), p| (xx + (p[0] - mx).powi(2), xy + (p[0] - mx) * (p[1] - my)));
+    (sxx > 0.0).then(|| [my - sxy / sxx * mx, sxy / sxx])
 }
 
 /// Columns after `from` at which the profile turns most, between 0 and `base`.

@@ -1,12 +1,15 @@
 //! Which points are wall: the mean section along the axis, and what does not belong to it.
 
 pub mod floor;
+mod long_things;
+pub mod quality;
 pub mod sampling;
 pub mod section_field;
 pub mod surfaces;
 pub(crate) mod unrolled_grid;
 
 pub use floor::Floor;
+pub use quality::{Quality, VertexQuality};
 pub use sampling::Sampling;
 pub use section_field::SectionField;
 
@@ -57,6 +60,57 @@ pub struct Settings {
     /// Points farther than this behind the mean section are outside, metres; by default 0.4 of the local mean radius,
     /// at least 0.15 m.
     pub max_offset_m: Option<f64>,
+    /// LAS classification codes that are believed instead of judging the points anew.
+    pub from_classification: FromClassification,
+}
+
+/// LAS classification codes that decide the class of a point; a code may be named once.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FromClassification {
+    /// Codes of rock or lining.
+    pub wall: Vec<u8>,
+    /// Codes of the ground, e.g. 2.
+    pub floor: Vec<u8>,
+    /// Codes of ducts, cables, vehicles, people.
+    pub furniture: Vec<u8>,
+    /// Codes of what does not belong to the tunnel.
+    pub outside: Vec<u8>,
+    /// Codes of outliers, e.g. 7 and 18.
+    pub noise: Vec<u8>,
+}
+
+impl FromClassification {
+    fn lists(&self) -> [(Class, &[u8]); 5] {
+        [
+            (Class::Wall, &self.wall),
+            (Class::Floor, &self.floor),
+            (Class::Furniture, &self.furniture),
+            (Class::Outside, &self.outside),
+            (Class::Noise, &self.noise),
+        ]
+    }
+
+    /// Whether any code decides anything.
+    pub fn is_empty(&self) -> bool {
+        self.lists().iter().all(|(_, codes)| codes.is_empty())
+    }
+
+    /// The class that a code decides.
+    ///
+    /// # Errors
+    /// [`Error::CodeTwice`] when a code is named for two classes.
+    pub fn table(&self) -> Result<[Option<Class>; 256], Error> {
+        let mut table = [None; 256];
+        for (class, codes) in self.lists() {
+            for &code in codes {
+                if table[code as usize].replace(class).is_some_and(|before| before != class) {
+                    return Err(Error::CodeTwice { code });
+                }
+            }
+        }
+        Ok(table)
+    }
 }
 
 /// The class of each geometry point, the mean section and the points' coordinates around the axis.
@@ -91,8 +145,14 @@ pub struct Summary {
     pub sampling: Sampling,
     /// Pieces of connected surface in the depth picture.
     pub patches: surfaces::PatchCounts,
+    /// Cables, pipes, rails found close to the surface. Not looked for in profile scans.
+    pub long_things: usize,
+    /// Points on them.
+    pub long_thing_points: usize,
     /// Whether a level floor was found.
     pub has_floor: bool,
+    /// Points whose class was taken from the classification of the scan.
+    pub given_points: usize,
     /// What a person should know.
     pub warnings: Vec<Warning>,
 }
@@ -110,6 +170,12 @@ pub enum Error {
         /// Points given.
         found: usize,
     },
+    /// A classification code stands for two classes.
+    #[error("segment.from_classification names code {code} for two classes")]
+    CodeTwice {
+        /// The code.
+        code: u8,
+    },
 }
 
 /// Finds the mean section and the class of each point.
@@ -118,6 +184,19 @@ pub enum Error {
 /// [`Error`] when the points do not surround the axis anywhere.
 pub fn classify_positions(
     positions: &[Vec3],
+    axis: &Axis,
+    settings: &Settings,
+) -> Result<(Segmentation, Summary), Error> {
+    classify(positions, |_| None, axis, settings)
+}
+
+/// As [`classify_positions`], with the class of some points `given` beforehand.
+///
+/// # Errors
+/// As [`classify_positions`].
+pub fn classify(
+    positions: &[Vec3],
+    given: impl Fn(usize) -> Option<Class> + Sync,
     axis: &Axis,
     settings: &Settings,
 ) -> Result<(Segmentation, Summary), Error> {
@@ -153,10 +232,16 @@ pub fn classify_positions(
     let grid = Grid::new(&section, row_m, column_m);
     let (cells, _) = CellPoints::sort(
         &grid,
-        coordinates.par_iter().zip(&class).map(|(c, k)| (*k != Class::Outside).then(|| grid.unroll(&section, c))),
+        coordinates.par_iter().zip(&class).enumerate().map(|(i, (c, k))| {
+            // What is known to be no surface takes no part in the picture.
+            let takes_part = *k != Class::Outside && given(i).is_none_or(Class::is_surface);
+            takes_part.then(|| grid.unroll(&section, c))
+        }),
     );
     let mean_radius = section.mean_perimeter() / std::f64::consts::TAU;
     let (patches, depth) = surfaces::classify(&grid, &cells, &section, mean_radius, &mut class);
+    let (long_things, long_thing_points) =
+        if sampling.is_profiles() { (0, 0) } else { long_things::find(&grid, &cells, &mut class) };
     drop(cells);
     let floor = if axis.is_shaft() { None } else { floor::find(&grid, &section, &depth) };
     if let Some(floor) = &floor {
@@ -166,6 +251,7 @@ pub fn classify_positions(
             }
         });
     }
+    class.par_iter_mut().enumerate().for_each(|(i, k)| *k = given(i).unwrap_or(*k));
     // Once more without the furniture: a duct must not lengthen the girth of the wall behind it.
     let surface: Vec<AxisCoordinates> =
         coordinates.iter().zip(&class).filter(|(_, k)| k.is_surface()).map(|(c, _)| *c).collect();
@@ -174,10 +260,12 @@ pub fn classify_positions(
     let floor = floor.map(|f| f.on(&section, &cleared));
     let section = cleared;
     class.par_iter_mut().zip(&coordinates).for_each(|(k, c)| {
+        // Even a given class does not make a surface beyond the portals.
         if k.is_surface() && (c.chainage < section.start() || c.chainage > section.end()) {
             *k = Class::Outside;
         }
     });
+    let given_points = (0..positions.len()).into_par_iter().filter(|&i| given(i).is_some()).count();
     let summary = Summary {
         points_by_class: Class::ALL.map(|k| (k, class.iter().filter(|&&c| c == k).count())).to_vec(),
         start_chainage_m: section.start(),
@@ -186,7 +274,10 @@ pub fn classify_positions(
         bridged_percent: 100.0 * section.bridged_share(),
         sampling,
         patches,
+        long_things,
+        long_thing_points,
         has_floor: floor.is_some(),
+        given_points,
         warnings: Vec::new(),
     };
     Ok((Segmentation { class, coordinates, section, sampling, floor }, summary))
@@ -230,6 +321,66 @@ mod tests {
         assert!(wall.0 > 0.98 && wall.1 > 0.97, "wall {wall:?} {summary:?}");
         assert!(floor.0 > 0.95 && floor.1 > 0.95, "floor {floor:?} {summary:?}");
         assert!(summary.has_floor && summary.patches.furniture_patches > 0);
+    }
+
+    /// Four stations, 3 mm noise, 0.5 % outliers, everything that stands in the way: the whole way from the scan.
+    #[test]
+    fn the_classes_of_a_furnished_tunnel_agree_with_the_truth() {
+        use crate::synthetic::{Course, Kind, Recipe, Shape};
+        let horseshoe = Shape::Horseshoe { width_m: 4.6, height_m: 4.2 };
+        let all = [Kind::Duct, Kind::Cables, Kind::Rails, Kind::Vehicle];
+        let cases = [
+            (horseshoe, Course::Bend, 1, 0.05, &all[..]),
+            (horseshoe, Course::Ramp, 12, 0.1, &all[..]),
+            (Shape::Circle { radius_m: 2.5 }, Course::Straight, 1, 0.05, &all[..2]),
+        ];
+        for (shape, course, seed, roughness_m, furniture) in cases {
+            let recipe = Recipe {
+                shape,
+                course,
+                seed,
+                roughness_m,
+                furniture: furniture.to_vec(),
+                length_m: 30.0,
+                gradient_percent: 12.0,
+                stations: 4,
+                noise_m: 0.003,
+                outlier_share: 0.005,
+                ..Recipe::default()
+            };
+            let scan = scan(&recipe.tunnel().unwrap(), &recipe.plan().unwrap()).unwrap();
+            let (geometry, _) = clean::clean(&scan.cloud, &clean::Settings::default()).unwrap();
+            let (axis, _) = crate::axis::trace(geometry.positions(), &crate::axis::Settings::default()).unwrap();
+            let (found, summary) = classify_positions(geometry.positions(), &axis, &Settings::default()).unwrap();
+            let class: Vec<Class> = geometry
+                .geometry_of_point()
+                .iter()
+                .map(|&g| if g == DROPPED { Class::Noise } else { found.class[g as usize] })
+                .collect();
+            let wall = score(&scan.truth.surface, &class, Surface::Wall, Class::Wall);
+            assert!(wall.0 >= 0.99 && wall.1 >= 0.98, "{shape:?} {course:?} {seed}: wall {wall:?} {summary:?}");
+            let furniture = score(&scan.truth.surface, &class, Surface::Furniture, Class::Furniture);
+            assert!(furniture.0 >= 0.97 && furniture.1 >= 0.94, "{shape:?} {course:?} {seed}: furniture {furniture:?}");
+            if shape == horseshoe {
+                let floor = score(&scan.truth.surface, &class, Surface::Floor, Class::Floor);
+                assert!(floor.0 >= 0.97 && floor.1 >= 0.97, "{shape:?} {course:?} {seed}: floor {floor:?} {summary:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_class_that_the_file_knows_is_believed() {
+        let tunnel = Tunnel::smooth(Section::circle(2.0), Alignment::straight(10.0));
+        let scan = scan(&tunnel, &ScanPlan { points: 40_000, ..ScanPlan::default() }).unwrap();
+        let codes = FromClassification { furniture: vec![65], noise: vec![7, 18], ..FromClassification::default() };
+        let table = codes.table().unwrap();
+        let given = |i: usize| table[if i % 10 == 0 { 65 } else { 1 }];
+        let (found, summary) = classify(scan.cloud.positions(), given, &tunnel.axis(), &Settings::default()).unwrap();
+        assert_eq!(summary.given_points, scan.cloud.len().div_ceil(10));
+        assert!(found.class.iter().step_by(10).all(|c| *c == Class::Furniture));
+        assert!(found.class[1..10].iter().all(|c| *c == Class::Wall));
+        let twice = FromClassification { wall: vec![65], ..codes };
+        assert_eq!(twice.table().unwrap_err(), Error::CodeTwice { code: 65 });
     }
 
     #[test]

@@ -1,13 +1,15 @@
 //! The k nearest neighbours of every point of a cloud at once.
 //!
 //! Points are sorted along a Morton curve and cut into small bundles, which a binary tree of boxes holds together. All
-//! points of a bundle search together: candidates first from the bundles beside it, then from the tree wherever a box
-//! is nearer than the worst candidate. Distances are computed bundle by bundle from contiguous memory, which is about
-//! three times faster than asking a k-d tree point by point. Exact for any distribution; fast for points on surfaces.
+//! points of a bundle search together: the radius that sufficed for the bundle before is tried first, the points of
+//! the tree within it are gathered once, as 32-bit offsets from the bundle, and each point of the bundle takes its
+//! nearest from the list; where the radius held too few it grows and the point looks again. The last choice is made
+//! with 64-bit distances, so the answers are exact for any distribution; it is fast for points on surfaces.
 //!
 //! Guarantees: neighbours sorted by distance and index, the same on any number of threads.
 //! Reference for the tree over the curve: C. Lauterbach et al., "Fast BVH construction on GPUs", Computer Graphics
 //! Forum 28(2), 2009, doi:10.1111/j.1467-8659.2009.01377.x (here cut at jumps of the curve instead of at key bits).
+//! Cost: one sort of integers, and about 0.4 microseconds a point for 16 neighbours.
 
 use super::{Neighbour, VoxelGrid};
 use crate::numeric::Vec3;
@@ -17,36 +19,21 @@ use rayon::prelude::*;
 const BUNDLE: usize = 16;
 /// Bundles handled by one task.
 const TASK: usize = 64;
+/// The square of the radius tried first, in squares of the radius that the bundle before needed.
+const FIRST_TRY: f64 = 1.25;
+/// A bundle wider than this many radii is searched point by point: its common list would be long.
+const WIDE: f64 = 4.0;
+/// Relative error of squared distances in 32 bits, with a margin.
+const ROUNDING: f32 = 4e-6;
 
 /// Calls `visit(i, neighbours)` for every point `i` with its `count` nearest points (itself included; all of them when
 /// there are fewer), nearest first, and collects the answers in point order. Points must be finite.
-pub fn for_each_neighbourhood<T: Send>(
+pub fn for_each_neighbourhood<T: Send + Clone>(
     points: &[Vec3],
     count: usize,
     visit: impl Fn(usize, &[Neighbour]) -> T + Sync,
 ) -> Vec<T> {
-    if points.is_empty() || count == 0 {
-        return (0..points.len()).map(|i| visit(i, &[])).collect();
-    }
-    let tree = BundleTree::new(points);
-    let answers: Vec<Vec<T>> = tree
-        .bundles
-        .par_chunks(TASK)
-        .map_init(Search::default, |search, bundles| {
-            let mut answers = Vec::new();
-            for &(start, end) in bundles {
-                tree.search(start as usize..end as usize, count, search, |at, found| {
-                    answers.push(visit(tree.order[at] as usize, found));
-                });
-            }
-            answers
-        })
-        .collect();
-    let mut slots: Vec<Option<T>> = (0..points.len()).map(|_| None).collect();
-    for (at, answer) in answers.into_iter().flatten().enumerate() {
-        slots[tree.order[at] as usize] = Some(answer);
-    }
-    slots.into_iter().map(|s| s.expect("every point is in one bundle")).collect()
+    BundleTree::new(points).for_each(count, visit)
 }
 
 #[derive(Clone, Copy)]
@@ -57,12 +44,9 @@ struct Box3 {
 
 impl Box3 {
     fn distance_squared(&self, other: &Self) -> f64 {
-        let gap = (self.low - other.high).sup(&(other.low - self.high)).sup(&Vec3::zeros());
-        gap.norm_squared()
-    }
-
-    fn distance_squared_to(&self, p: &Vec3) -> f64 {
-        (self.low - p).sup(&(p - self.high)).sup(&Vec3::zeros()).norm_squared()
+        let gap = |axis: usize| (self.low[axis] - other.high[axis]).max(other.low[axis] - self.high[axis]).max(0.0);
+        let [x, y, z] = [gap(0), gap(1), gap(2)];
+        x * x + y * y + z * z
     }
 }
 
@@ -75,7 +59,8 @@ struct Node {
     second: u32,
 }
 
-struct BundleTree {
+/// Points ready to be asked for the neighbours of each of them.
+pub struct BundleTree {
     /// Coordinates along the curve.
     x: Vec<f64>,
     y: Vec<f64>,
@@ -89,16 +74,28 @@ struct BundleTree {
 /// Reusable memory of a search.
 #[derive(Default)]
 struct Search {
-    candidates: Vec<Vec<Neighbour>>,
-    worst: Vec<f64>,
-    queries: Vec<Vec3>,
+    /// Squared radius that the last bundle needed; 0 before the first.
+    radius_squared: f64,
     stack: Vec<u32>,
+    /// Gathered points: offsets from the middle of the bundle and places on the curve.
+    x: Vec<f32>,
+    y: Vec<f32>,
+    z: Vec<f32>,
+    at: Vec<u32>,
+    squared: Vec<f32>,
+    /// Squared distance (its bits sort like the number) and number in the list.
+    keys: Vec<u64>,
+    found: Vec<Neighbour>,
 }
 
 impl BundleTree {
-    fn new(points: &[Vec3]) -> Self {
+    /// Sorts finite points and builds the tree.
+    pub fn new(points: &[Vec3]) -> Self {
+        let Some((low, high)) = super::voxel_grid::bounds(points) else {
+            let none = Vec::new;
+            return Self { x: none(), y: none(), z: none(), order: vec![], nodes: vec![], bundles: vec![] };
+        };
         // A cell of about one point on a surface; the order inside a cell does not matter.
-        let (low, high) = super::voxel_grid::bounds(points).expect("there are points");
         let extent = (high - low).amax();
         let cell_m = (extent / (points.len() as f64).sqrt()).max(1e-9 * extent).max(1e-12);
         let order = VoxelGrid::new(points, cell_m).into_order();
@@ -123,8 +120,85 @@ impl BundleTree {
         tree
     }
 
-    fn point(&self, at: usize) -> Vec3 {
-        Vec3::new(self.x[at], self.y[at], self.z[at])
+    /// As [`for_each_neighbourhood`].
+    pub fn for_each<T: Send + Clone>(&self, count: usize, visit: impl Fn(usize, &[Neighbour]) -> T + Sync) -> Vec<T> {
+        let id = |place: usize| self.order[place];
+        self.in_point_order(self.answers(count, &id, |place, found| visit(self.order[place] as usize, found)))
+    }
+
+    /// Calls `visit(place, neighbours)` for every place on the curve; neighbours are places too. Places that are near in
+    /// space are near in memory, which is what makes it faster than [`Self::for_each`]. Answers in the order of the curve.
+    pub fn for_each_place<T: Send>(&self, count: usize, visit: impl Fn(usize, &[Neighbour]) -> T + Sync) -> Vec<T> {
+        self.answers(count, &|place| place as u32, visit)
+    }
+
+    /// The answers for about `wanted` of the places, evenly spread in runs along the curve; in the order of the curve.
+    pub fn for_sample<T: Send>(
+        &self,
+        wanted: usize,
+        count: usize,
+        visit: impl Fn(usize, &[Neighbour]) -> T + Sync,
+    ) -> Vec<T> {
+        if count == 0 {
+            return Vec::new();
+        }
+        let stride = (self.order.len() / wanted.max(1)).max(1);
+        let some: Vec<(u32, u32)> = self.bundles.iter().copied().step_by(stride).collect();
+        let parts: Vec<Vec<T>> = some
+            .par_chunks(TASK)
+            .map(|bundles| {
+                let alone = bundles.iter().flat_map(|b| self.answer(&[*b], count, &|place| place as u32, &visit));
+                alone.collect()
+            })
+            .collect();
+        parts.into_iter().flatten().collect()
+    }
+
+    /// Values along the curve, put into the order of the points.
+    pub fn in_point_order<T: Clone + Send>(&self, along_curve: Vec<T>) -> Vec<T> {
+        let mut place = vec![0u32; self.order.len()];
+        for (at, &i) in self.order.iter().enumerate() {
+            place[i as usize] = at as u32;
+        }
+        place.into_iter().map(|at| along_curve[at as usize].clone()).collect()
+    }
+
+    /// The point at a place of the curve.
+    pub fn point(&self, place: usize) -> Vec3 {
+        Vec3::new(self.x[place], self.y[place], self.z[place])
+    }
+
+    fn answers<T: Send>(
+        &self,
+        count: usize,
+        id: &(impl Fn(usize) -> u32 + Sync),
+        visit: impl Fn(usize, &[Neighbour]) -> T + Sync,
+    ) -> Vec<T> {
+        if count == 0 {
+            return (0..self.order.len()).map(|place| visit(place, &[])).collect();
+        }
+        let answers: Vec<Vec<T>> =
+            self.bundles.par_chunks(TASK).map(|bundles| self.answer(bundles, count, id, &visit)).collect();
+        let mut all = Vec::with_capacity(self.order.len());
+        answers.into_iter().for_each(|part| all.extend(part));
+        all
+    }
+
+    fn answer<T>(
+        &self,
+        bundles: &[(u32, u32)],
+        count: usize,
+        id: &impl Fn(usize) -> u32,
+        visit: &impl Fn(usize, &[Neighbour]) -> T,
+    ) -> Vec<T> {
+        let mut search = Search::default();
+        let mut answers = Vec::with_capacity(bundles.len() * BUNDLE);
+        for &(start, end) in bundles {
+            self.search(start as usize..end as usize, count.min(self.order.len()), id, &mut search, |at, found| {
+                answers.push(visit(at, found));
+            });
+        }
+        answers
     }
 
     /// Two halves, cut where the curve jumps farthest within the middle third; one part if it is small.
@@ -200,32 +274,68 @@ impl BundleTree {
         &self,
         bundle: std::ops::Range<usize>,
         count: usize,
+        id: &impl Fn(usize) -> u32,
         search: &mut Search,
         mut visit: impl FnMut(usize, &[Neighbour]),
     ) {
-        let Search { candidates, worst, queries, stack } = search;
-        queries.clear();
-        queries.extend(bundle.clone().map(|at| self.point(at)));
-        candidates.resize_with(queries.len().max(candidates.len()), Vec::new);
-        worst.clear();
-        worst.resize(queries.len(), f64::INFINITY);
-        // Along the curve the nearest are near: enough of them for a first bound.
-        let reach = count.max(BUNDLE);
-        let seeded = bundle.start.saturating_sub(reach)..(bundle.end + reach).min(self.order.len());
-        for (q, query) in queries.iter().enumerate() {
-            candidates[q].clear();
-            self.offer(query, seeded.clone(), count, &mut candidates[q], &mut worst[q]);
-            shrink(&mut candidates[q], count, &mut worst[q]);
+        if search.radius_squared <= 0.0 {
+            search.radius_squared = self.first_radius_squared(bundle.start, count);
         }
-        let own = queries
-            .iter()
-            .fold(Box3 { low: queries[0], high: queries[0] }, |b, q| Box3 { low: b.low.inf(q), high: b.high.sup(q) });
-        let mut bound = worst.iter().copied().fold(0.0, f64::max);
+        let own = bundle.clone().map(|at| self.point(at)).fold(
+            Box3 { low: self.point(bundle.start), high: self.point(bundle.start) },
+            |b, p| Box3 { low: b.low.inf(&p), high: b.high.sup(&p) },
+        );
+        let mut radius_squared = search.radius_squared * FIRST_TRY;
+        let wide = (own.high - own.low).norm_squared() > WIDE * WIDE * radius_squared;
+        if !wide {
+            self.gather(&own, radius_squared, search);
+        }
+        let mut needed = 0.0f64;
+        for at in bundle {
+            // Points of a wide bundle have a list of their own and start anew.
+            let from = if wide { Box3 { low: self.point(at), high: self.point(at) } } else { own };
+            let mut tried = if wide { search.radius_squared * FIRST_TRY } else { radius_squared };
+            if wide {
+                self.gather(&from, tried, search);
+            }
+            while !self.choose(at, &from, tried, count, id, search) {
+                // The emptier the surroundings turn out to be, the more the radius grows.
+                let share = count as f64 / search.keys.len().max(1) as f64;
+                tried *= (1.3 * share).clamp(1.5, 16.0);
+                self.gather(&from, tried, search);
+            }
+            radius_squared = tried;
+            visit(at, &search.found);
+            needed = needed.max(search.found.last().map_or(0.0, |n| n.distance_squared));
+        }
+        // A lone point must not make its successors gather half the cloud.
+        let before = search.radius_squared;
+        search.radius_squared = if needed > 0.0 { needed.clamp(before / 4.0, before * 4.0) } else { before };
+    }
+
+    /// A squared radius that is not far from what a place needs: that of its neighbours on the curve.
+    fn first_radius_squared(&self, at: usize, count: usize) -> f64 {
+        let near = at.saturating_sub(count)..(at + count + 1).min(self.order.len());
+        let p = self.point(at);
+        let mut squared: Vec<f64> = near.map(|other| (self.point(other) - p).norm_squared()).collect();
+        let last = (count - 1).min(squared.len() - 1);
+        let (_, radius_squared, _) = squared.select_nth_unstable_by(last, f64::total_cmp);
+        // Equal points have no distance; any positive radius finds them.
+        radius_squared.max(f64::MIN_POSITIVE * 1e30)
+    }
+
+    /// Collects the points of all bundles that come within the radius of a box.
+    fn gather(&self, own: &Box3, radius_squared: f64, search: &mut Search) {
+        let Search { stack, x, y, z, at, .. } = search;
+        (x.clear(), y.clear(), z.clear(), at.clear());
+        let middle = (own.low + own.high) / 2.0;
+        let reach = radius_squared.sqrt() * (1.0 + 1e-6);
+        let (low, high) = (own.low.add_scalar(-reach), own.high.add_scalar(reach));
         stack.clear();
         stack.push(0);
         while let Some(node) = stack.pop() {
             let n = &self.nodes[node as usize];
-            if n.bounds.distance_squared(&own) > bound {
+            if n.bounds.distance_squared(own) > radius_squared {
                 continue;
             }
             if n.second != 0 {
@@ -233,69 +343,103 @@ impl BundleTree {
                 stack.push(node + 1);
                 continue;
             }
+            // Written first, kept if inside: no branch to guess.
             let (start, end) = (n.start as usize, n.end as usize);
-            if start >= seeded.start && end <= seeded.end {
-                continue;
+            let mut next = at.len();
+            for list in [&mut *x, &mut *y, &mut *z] {
+                list.resize(next + end - start, 0.0);
             }
-            for (q, query) in queries.iter().enumerate() {
-                if n.bounds.distance_squared_to(query) <= worst[q] {
-                    // A bundle may be seeded in part.
-                    for part in [start..end.min(seeded.start).max(start), start.max(seeded.end).min(end)..end] {
-                        self.offer(query, part, count, &mut candidates[q], &mut worst[q]);
-                    }
-                }
+            at.resize(next + end - start, 0);
+            for k in start..end {
+                let p = [self.x[k], self.y[k], self.z[k]];
+                x[next] = (p[0] - middle.x) as f32;
+                y[next] = (p[1] - middle.y) as f32;
+                z[next] = (p[2] - middle.z) as f32;
+                at[next] = k as u32;
+                let inside = (p[0] >= low.x) & (p[0] <= high.x) & (p[1] >= low.y);
+                next += usize::from(inside & (p[1] <= high.y) & (p[2] >= low.z) & (p[2] <= high.z));
             }
-            bound = worst.iter().copied().fold(0.0, f64::max);
-        }
-        for (q, at) in bundle.enumerate() {
-            shrink(&mut candidates[q], count, &mut worst[q]);
-            candidates[q].sort_unstable_by(by_distance);
-            visit(at, &candidates[q]);
+            for list in [&mut *x, &mut *y, &mut *z] {
+                list.truncate(next);
+            }
+            at.truncate(next);
         }
     }
 
-    /// Adds the points of a range that are no farther than the worst candidate.
-    fn offer(
+    /// Finds the nearest of the gathered points, exactly; false when there are fewer than `count` within the radius.
+    /// Leaves the number of points within the radius in `search.keys`.
+    fn choose(
         &self,
-        query: &Vec3,
-        range: std::ops::Range<usize>,
+        at: usize,
+        own: &Box3,
+        radius_squared: f64,
         count: usize,
-        candidates: &mut Vec<Neighbour>,
-        worst: &mut f64,
-    ) {
-        let (xs, ys, zs) = (&self.x[range.clone()], &self.y[range.clone()], &self.z[range.clone()]);
-        let mut squared = [0.0; BUNDLE];
-        for block in 0..range.len().div_ceil(BUNDLE) {
-            let from = block * BUNDLE;
-            let len = BUNDLE.min(range.len() - from);
-            let (bx, by, bz) = (&xs[from..from + len], &ys[from..from + len], &zs[from..from + len]);
-            for i in 0..len {
-                let (dx, dy, dz) = (bx[i] - query.x, by[i] - query.y, bz[i] - query.z);
-                squared[i] = dx * dx + dy * dy + dz * dz;
-            }
-            for (i, &distance_squared) in squared[..len].iter().enumerate() {
-                if distance_squared <= *worst {
-                    candidates.push(Neighbour { index: self.order[range.start + from + i], distance_squared });
-                }
-            }
-            if candidates.len() >= 2 * count + BUNDLE {
-                shrink(candidates, count, worst);
-            }
+        id: &impl Fn(usize) -> u32,
+        search: &mut Search,
+    ) -> bool {
+        let Search { x, y, z, at: places, squared, keys, found, .. } = search;
+        let p = self.point(at);
+        let middle = (own.low + own.high) / 2.0;
+        let q = [(p.x - middle.x) as f32, (p.y - middle.y) as f32, (p.z - middle.z) as f32];
+        squared.clear();
+        squared.extend(x.iter().zip(y.iter()).zip(z.iter()).map(|((x, y), z)| {
+            let (dx, dy, dz) = (x - q[0], y - q[1], z - q[2]);
+            dx * dx + dy * dy + dz * dz
+        }));
+        // Offsets are rounded relative to the size of the list, distances relative to themselves.
+        let size = (own.high - own.low).norm() + radius_squared.sqrt();
+        let slack = (ROUNDING as f64 * size) as f32;
+        let limit = radius_squared as f32;
+        let everything = places.len() == self.order.len();
+        keys.clear();
+        keys.resize(squared.len(), 0);
+        let mut inside = 0;
+        for (number, &s) in squared.iter().enumerate() {
+            keys[inside] = u64::from(s.to_bits()) << 32 | number as u64;
+            inside += usize::from(s <= limit || everything);
         }
+        keys.truncate(inside);
+        if inside < count {
+            return false;
+        }
+        let nth = |keys: &mut Vec<u64>| f32::from_bits((*keys.select_nth_unstable(count - 1).1 >> 32) as u32);
+        let worst = nth(keys);
+        // Everything that 32 bits cannot tell from the last one is kept for the choice with 64 bits.
+        let doubtful = (worst.sqrt() + slack).powi(2) * (1.0 + ROUNDING);
+        if doubtful > limit && !everything {
+            return false;
+        }
+        let near = {
+            let mut near = 0;
+            for i in 0..keys.len() {
+                let key = keys[i];
+                keys[near] = key;
+                near += usize::from(f32::from_bits((key >> 32) as u32) <= doubtful);
+            }
+            &mut keys[..near]
+        };
+        near.sort_unstable();
+        found.clear();
+        for &key in near.iter() {
+            let k = places[key as u32 as usize] as usize;
+            let (dx, dy, dz) = (self.x[k] - p.x, self.y[k] - p.y, self.z[k] - p.z);
+            let new = Neighbour { index: id(k), distance_squared: dx * dx + dy * dy + dz * dz };
+            // In order but for the last bits: insertion costs one comparison for nearly all.
+            let mut slot = found.len();
+            found.push(new);
+            while slot > 0 && by_distance(&new, &found[slot - 1]).is_lt() {
+                found[slot] = found[slot - 1];
+                slot -= 1;
+            }
+            found[slot] = new;
+        }
+        found.truncate(count);
+        true
     }
 }
 
 fn by_distance(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
     a.distance_squared.total_cmp(&b.distance_squared).then(a.index.cmp(&b.index))
-}
-
-/// Keeps the `count` nearest candidates and sets the distance of the worst.
-fn shrink(candidates: &mut Vec<Neighbour>, count: usize, worst: &mut f64) {
-    if candidates.len() >= count {
-        let (_, last, _) = candidates.select_nth_unstable_by(count - 1, by_distance);
-        *worst = last.distance_squared;
-        candidates.truncate(count);
-    }
 }
 
 #[cfg(test)]

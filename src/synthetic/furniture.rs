@@ -37,6 +37,13 @@ pub(super) struct Sheet {
     pub size: [f64; 2],
 }
 
+impl Sheet {
+    /// The axis across a side of a box: 0 along the tunnel, 1 right, 2 up.
+    pub fn axis(&self) -> usize {
+        self.side.0
+    }
+}
+
 impl Item {
     /// A ventilation duct along the whole tunnel.
     pub fn duct(length_m: f64, right: f64, up: f64, radius_m: f64) -> Self {

@@ -22,6 +22,7 @@ mod rock;
 mod scanner;
 mod section;
 mod tunnel;
+mod view;
 
 pub use alignment::{Alignment, Error as AlignmentError, Stretch};
 pub use fracture::Fracture;
@@ -33,3 +34,4 @@ pub use rock::Rock;
 pub use scanner::{Error, ScanPlan, Surface, SyntheticScan, Truth, scan};
 pub use section::{Foot, OutlinePoint, Section};
 pub use tunnel::{KnownMesh, SectionPoint, Tunnel, WallPoint};
+pub use view::{Part, View};

@@ -6,6 +6,7 @@ use super::lettering::Wall;
 use super::scanner::{Error, ScanPlan};
 use super::section::Section;
 use super::tunnel::Tunnel;
+use super::view::View;
 use crate::numeric::Vec3;
 
 /// Clearance between what hangs in the tunnel and the smooth wall, metres.
@@ -104,6 +105,8 @@ pub struct Recipe {
     pub colored: bool,
     /// Origin of the tunnel in the coordinates of the scan.
     pub origin_in_scan: Vec3,
+    /// What the scan sees of the tunnel.
+    pub view: View,
     /// Same seed, same scan.
     pub seed: u64,
 }
@@ -128,6 +131,7 @@ impl Default for Recipe {
             colored: true,
             // Coordinates as large as those of a national grid: they must survive every step.
             origin_in_scan: Vec3::new(568_200.0, 6_642_300.0, 148.0),
+            view: View::default(),
             seed: 12,
         }
     }
@@ -193,6 +197,7 @@ impl Recipe {
             outlier_share: self.outlier_share,
             origin_in_scan: self.origin_in_scan,
             seed: self.seed,
+            view: self.view,
             colored: self.colored,
             ..ScanPlan::default()
         })

@@ -6,6 +6,7 @@
 
 use super::furniture::Sheet;
 use super::tunnel::Tunnel;
+use super::view::View;
 use crate::cloud::{self, Attributes, Cloud, Label, ScanFrame, SourceFile, Station};
 use crate::numeric::Vec3;
 use rand::{Rng, SeedableRng};
@@ -78,6 +79,8 @@ pub struct ScanPlan {
     pub colored: bool,
     /// Where the local origin lies in the coordinates of the scan.
     pub origin_in_scan: Vec3,
+    /// What is seen of the tunnel.
+    pub view: View,
     /// Same seed, same scan.
     pub seed: u64,
 }
@@ -96,6 +99,7 @@ impl Default for ScanPlan {
             nadir_cone_deg: 30.0,
             colored: true,
             origin_in_scan: Vec3::zeros(),
+            view: View::default(),
             seed: 1,
         }
     }
@@ -245,12 +249,15 @@ pub fn scan(tunnel: &Tunnel, plan: &ScanPlan) -> Result<SyntheticScan, Error> {
 }
 
 fn check(plan: &ScanPlan) -> Result<(), Error> {
+    let profile_m = plan.view.profile_m.unwrap_or(1.0);
     let rules = [
         ("points", plan.points as f64, plan.points > 0, "at least 1"),
         ("range_noise_m", plan.range_noise_m, (0.0..1.0).contains(&plan.range_noise_m), "from 0 to below 1"),
         ("outlier_share", plan.outlier_share, (0.0..1.0).contains(&plan.outlier_share), "from 0 to below 1"),
         ("max_range_m", plan.max_range_m, plan.max_range_m > 0.0, "positive"),
         ("saturation_range_m", plan.saturation_range_m, plan.saturation_range_m > 0.0, "positive"),
+        ("gap share", plan.view.gap_share, (0.0..1.0).contains(&plan.view.gap_share), "from 0 to below 1"),
+        ("profile_m", profile_m, profile_m > 0.0 && profile_m.is_finite(), "positive"),
         ("nadir_cone_deg", plan.nadir_cone_deg, (0.0..90.0).contains(&plan.nadir_cone_deg), "from 0 to below 90"),
     ];
     match rules.into_iter().find(|r| !r.2) {
@@ -322,9 +329,10 @@ impl Scanner<'_> {
         for i in 0..PROBES {
             for j in 0..PROBES {
                 let share = |k: usize| (k as f64 + 0.5) / PROBES as f64;
-                let hit = self.hit(target, target.place(cell, share(i), share(j)));
+                let at = target.place(cell, share(i), share(j));
+                let hit = self.hit(target, at);
                 let density = self.density(station, &hit);
-                if density == 0.0 {
+                if density == 0.0 || !self.is_seen(target, at, &hit) {
                     bend_hides = true;
                     continue;
                 }
@@ -357,6 +365,17 @@ impl Scanner<'_> {
             normal: frame.forward * normal[0] - frame.left * normal[1] + frame.up * normal[2],
             in_section,
         }
+    }
+
+    /// Whether the place belongs to what the scan sees.
+    fn is_seen(&self, target: &Target, at: [f64; 2], hit: &Hit) -> bool {
+        // Gaps are patches of the wall; a thing in front of one is missing where the wall behind it would be.
+        let girth = match target.sheet {
+            None => at[1],
+            Some(_) => self.tunnel.section.foot(hit.in_section[1], hit.in_section[2]).girth,
+        };
+        let crown_up = self.tunnel.section.point(0.0).up;
+        self.plan.view.sees(&hit.in_section, girth, crown_up, self.plan.seed)
     }
 
     /// Points per square metre, up to a factor.
@@ -450,8 +469,11 @@ impl Scanner<'_> {
             // The R2 sequence: evenly spread for any number of points.
             place = [(place[0] + 0.754_877_666_246_692_8).fract(), (place[1] + 0.569_840_290_998_053_3).fract()];
             let at = target.place(deal.cell, place[0], place[1]);
+            let item = target.sheet.as_ref().map(|s| (&self.tunnel.furniture[s.item], s.axis()));
+            let Some(at) = self.plan.view.on_profile(at, item) else { continue };
             let hit = self.hit(target, at);
             if self.density(deal.station, &hit) == 0.0
+                || !self.is_seen(target, at, &hit)
                 || (deal.bend_hides && !self.bend_clear(deal.station, &hit))
                 || !self.furniture_clear(deal.station, &hit)
                 || !self.relief_clear(deal.station, target, &hit)

@@ -235,6 +235,7 @@ fn write_strip(strip: &Strip, frame: &ScanFrame, path: &Path) -> Result<()> {
         faces: mesh.faces(),
         observed_vertices: Some(&observed),
         observed_faces: Some(mesh.observed()),
+        quality: None,
     };
     ply::write_mesh(&file, path).map_err(|e| Failure::new(Exit::Resources, e))
 }

@@ -105,6 +105,8 @@ pub(super) const MICROMETRE: f64 = 1e-6;
 /// The types of the columns that Adit writes; the values are the type codes of the specification.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum ScalarKind {
+    /// Plain unsigned byte.
+    U8 = 1,
     /// Plain unsigned integer.
     U32 = 5,
     /// Micrometres in 32 bits, up to 2.1 km.
@@ -116,7 +118,7 @@ pub(super) enum ScalarKind {
 impl ScalarKind {
     pub(super) fn no_data(self) -> Option<i64> {
         match self {
-            Self::U32 => None,
+            Self::U8 | Self::U32 => None,
             Self::I32Micrometres => Some(i64::from(i32::MIN)),
             Self::I64Micrometres => Some(i64::MIN),
         }

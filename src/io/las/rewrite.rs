@@ -2,7 +2,7 @@
 
 use super::super::error::Error;
 use super::super::source_bytes::SourceBytes;
-use super::super::write::{PointColumns, PointOfRecord, WriteSummary};
+use super::super::write::{NO_CLASS, PointColumns, PointOfRecord, WriteSummary};
 use super::extra_bytes::{ExtraField, MICROMETRE, ScalarKind};
 use super::header::{Container, EVLR_HEADER, VLR_HEADER, Vlr};
 use super::read::extra_fields;
@@ -16,9 +16,18 @@ use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::Path;
 
 /// Names of the appended columns, in their order.
-const NAMES: [&str; 4] = ["label", "chainage", "girth", "offset"];
+static NAMES: [&str; 5] = ["label", "chainage", "girth", "offset", "surface_class"];
+
+/// Names of the columns that are appended; those of the source with these names give way.
+fn appended_names(columns: &PointColumns) -> &'static [&'static str] {
+    if columns.surface_classes.is_some() { &NAMES } else { &NAMES[..4] }
+}
+
 /// Bytes that the appended columns take in a record.
-const APPENDED: usize = 4 + 8 + 4 + 4;
+fn appended_len(columns: &PointColumns) -> usize {
+    4 + 8 + 4 + 4 + usize::from(columns.surface_classes.is_some())
+}
+
 /// Points of a LAZ chunk; what all readers expect.
 const LAZ_CHUNK: usize = 50_000;
 /// Bytes of records in flight between decoding and compressing.
@@ -39,6 +48,9 @@ fn append_columns(columns: &PointColumns, point: Option<usize>, out: &mut Vec<u8
     for column in [columns.girth, columns.offset] {
         out.extend_from_slice(&(micrometres(at(column), ScalarKind::I32Micrometres) as i32).to_le_bytes());
     }
+    if let Some(classes) = columns.surface_classes {
+        out.push(point.map_or(NO_CLASS, |p| classes[p]));
+    }
 }
 
 /// Descriptors of the appended columns with their ranges.
@@ -54,12 +66,19 @@ fn appended_fields(columns: &PointColumns) -> Vec<ExtraField> {
     };
     let labels = columns.labels.iter().minmax();
     let (long, short) = (ScalarKind::I64Micrometres, ScalarKind::I32Micrometres);
-    vec![
+    let mut fields = vec![
         ExtraField::scalar(NAMES[0], ScalarKind::U32, labels, "fracture label, 0: none"),
         ExtraField::scalar(NAMES[1], long, range(columns.chainage, long), "along the axis, m"),
         ExtraField::scalar(NAMES[2], short, range(columns.girth, short), "from crown, + right wall, m"),
         ExtraField::scalar(NAMES[3], short, range(columns.offset, short), "into the void, m"),
-    ]
+    ];
+    if let Some(classes) = columns.surface_classes {
+        let range = classes.iter().min().zip(classes.iter().max()).map(|(a, b)| [i64::from(*a), i64::from(*b)]);
+        // At most 31 characters: 0 wall, 1 floor, 2 furniture, 3 outside, 4 noise.
+        let meaning = "wall floor furn. outside noise";
+        fields.push(ExtraField::scalar(NAMES[4], ScalarKind::U8, range, meaning));
+    }
+    fields
 }
 
 trait MinMax {
@@ -88,14 +107,14 @@ struct Source<'a> {
 }
 
 impl<'a> Source<'a> {
-    fn open(file: &'a SourceFile) -> Result<Self, Error> {
+    fn open(file: &'a SourceFile, names: &[&str]) -> Result<Self, Error> {
         let bytes = SourceBytes::open(&file.path)?;
         let container = Container::read(&bytes)?;
         let (described, described_len) = extra_fields(&container);
         let standard = Layout::of(container.format).standard;
         let (mut kept, mut fields, mut replaced) = (Vec::new(), Vec::new(), Vec::new());
         for field in described {
-            if NAMES.contains(&field.name().as_str()) {
+            if names.contains(&field.name().as_str()) {
                 replaced.push(field.name());
             } else {
                 kept.push(standard + field.at..standard + field.at + field.size());
@@ -210,7 +229,8 @@ pub(in super::super) fn rewrite(
     columns: &PointColumns,
     destination: &Path,
 ) -> Result<WriteSummary, Error> {
-    let sources: Vec<Source> = cloud.sources().iter().map(Source::open).collect::<Result<_, _>>()?;
+    let sources: Vec<Source> =
+        cloud.sources().iter().map(|s| Source::open(s, appended_names(columns))).collect::<Result<_, _>>()?;
     let mut summary = WriteSummary::default();
     let first =
         sources.first().ok_or_else(|| Error::output(destination, "the cloud has no source file", "name one"))?;
@@ -220,8 +240,13 @@ pub(in super::super) fn rewrite(
     fields.extend(appended_fields(columns));
     let kept: usize = first.kept.iter().map(|r| r.len()).sum();
     let layout = Layout::of(first.container.format);
-    let mut output =
-        Output::create(destination, &first.container, &fields, layout.standard + kept + APPENDED, &mut summary)?;
+    let mut output = Output::create(
+        destination,
+        &first.container,
+        &fields,
+        layout.standard + kept + appended_len(columns),
+        &mut summary,
+    )?;
     let record_len = output.record_len;
     for source in &sources {
         let records = source.records()?;
@@ -561,7 +586,7 @@ pub(in super::super) fn write_new(
         }
         (None, None) => vec![],
     };
-    let extra = if columns.is_some() { APPENDED } else { fields.len() * 4 };
+    let extra = columns.map_or(fields.len() * 4, appended_len);
     let record_len = layout.standard + extra;
     let header = new_header(format, record_len, [step; 3], origin.into(), frame.crs.as_deref());
     let mut output = Output::create(destination, &header, &fields, record_len, &mut summary)?;

@@ -7,6 +7,7 @@ use super::header::{Header, Kind};
 use super::read::Walker;
 use crate::cloud::ScanFrame;
 use crate::numeric::{Vec2, Vec3};
+use crate::segment::VertexQuality;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -28,13 +29,16 @@ pub struct PlyMesh<'a> {
     pub observed_vertices: Option<&'a [bool]>,
     /// Whether scan points support the face, one value a face.
     pub observed_faces: Option<&'a [bool]>,
+    /// How well the surface was measured at each vertex.
+    pub quality: Option<&'a VertexQuality>,
 }
 
 /// Marks the comment that keeps the local frame, so that reading gives back the same local numbers.
 const FRAME_COMMENT: &str = "comment adit_frame";
 
-/// Writes a mesh as binary little endian PLY: vertex `double x y z [u v]`, `uchar observed`; face
-/// `list uchar int vertex_indices`, `[uchar observed]`. Positions are in scan coordinates, `u v` in metres.
+/// Writes a mesh as binary little endian PLY: vertex `double x y z [u v]`, `uchar observed`, `[float noise density
+/// [incidence], uchar surface_class]`; face `list uchar int vertex_indices`, `[uchar observed]`. Positions are in scan
+/// coordinates, `u v` and `noise` in metres, `density` in points a square metre, `incidence` in degrees.
 ///
 /// # Errors
 /// [`Error::Write`] when the operating system refuses.
@@ -51,6 +55,14 @@ pub fn write_mesh(mesh: &PlyMesh, path: &Path) -> Result<(), Error> {
             writeln!(out, "property double {name}")?;
         }
         writeln!(out, "property uchar observed")?;
+        let incidence = mesh.quality.is_some_and(|q| !q.incidence_deg.is_empty());
+        if mesh.quality.is_some() {
+            writeln!(out, "property float noise\nproperty float density")?;
+            if incidence {
+                writeln!(out, "property float incidence")?;
+            }
+            writeln!(out, "property uchar surface_class")?;
+        }
         writeln!(out, "element face {}\nproperty list uchar int vertex_indices", mesh.faces.len())?;
         if mesh.observed_faces.is_some() {
             writeln!(out, "property uchar observed")?;
@@ -65,6 +77,14 @@ pub fn write_mesh(mesh: &PlyMesh, path: &Path) -> Result<(), Error> {
                 out.write_all(&uv[i].y.to_le_bytes())?;
             }
             out.write_all(&[mesh.observed_vertices.is_none_or(|o| o[i]).into()])?;
+            if let Some(quality) = mesh.quality {
+                out.write_all(&quality.noise_m[i].to_le_bytes())?;
+                out.write_all(&quality.density_per_m2[i].to_le_bytes())?;
+                if incidence {
+                    out.write_all(&quality.incidence_deg[i].to_le_bytes())?;
+                }
+                out.write_all(&[quality.class[i]])?;
+            }
         }
         for (i, face) in mesh.faces.iter().enumerate() {
             out.write_all(&[3])?;

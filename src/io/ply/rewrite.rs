@@ -2,7 +2,7 @@
 
 use super::super::error::Error;
 use super::super::source_bytes::SourceBytes;
-use super::super::write::{PointColumns, PointOfRecord, WriteSummary};
+use super::super::write::{NO_CLASS, PointColumns, PointOfRecord, WriteSummary};
 use super::header::{Element, Encoding, Header, Kind};
 use super::read::Walker;
 use crate::cloud::{Cloud, SourceFile};
@@ -11,16 +11,22 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// Names and types of the appended properties, in their order.
-const APPENDED: [(&str, &str); 4] =
-    [("uint", "label"), ("double", "chainage"), ("double", "girth"), ("double", "offset")];
+static APPENDED: [(&str, &str); 5] =
+    [("uint", "label"), ("double", "chainage"), ("double", "girth"), ("double", "offset"), ("uchar", "surface_class")];
 
-fn is_appended(name: &str) -> bool {
-    APPENDED.iter().any(|(_, n)| *n == name)
+/// The properties that these columns append; those of the source with the same names give way.
+fn appended(columns: &PointColumns) -> &'static [(&'static str, &'static str)] {
+    if columns.surface_classes.is_some() { &APPENDED } else { &APPENDED[..4] }
+}
+
+fn is_appended(columns: &PointColumns, name: &str) -> bool {
+    appended(columns).iter().any(|(_, n)| *n == name)
 }
 
 fn append(columns: &PointColumns, point: Option<usize>, encoding: Encoding, out: &mut Vec<u8>) {
     let label = point.map_or(0, |p| columns.labels[p]);
     let lengths = [columns.chainage, columns.girth, columns.offset].map(|c| point.map_or(f64::NAN, |p| c[p]));
+    let class = columns.surface_classes.map(|classes| point.map_or(NO_CLASS, |p| classes[p]));
     match encoding {
         Encoding::Ascii => {
             out.extend_from_slice(label.to_string().as_bytes());
@@ -29,15 +35,20 @@ fn append(columns: &PointColumns, point: Option<usize>, encoding: Encoding, out:
                 let text = if v.is_nan() { " nan".to_owned() } else { format!(" {v}") };
                 out.extend_from_slice(text.as_bytes());
             }
+            if let Some(class) = class {
+                out.extend_from_slice(format!(" {class}").as_bytes());
+            }
             out.push(b'\n');
         }
         Encoding::LittleEndian => {
             out.extend_from_slice(&label.to_le_bytes());
             lengths.iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+            out.extend(class);
         }
         Encoding::BigEndian => {
             out.extend_from_slice(&label.to_be_bytes());
             lengths.iter().for_each(|v| out.extend_from_slice(&v.to_be_bytes()));
+            out.extend(class);
         }
     }
 }
@@ -65,14 +76,14 @@ fn rewrite_one(source: &SourceFile, columns: &PointColumns, destination: &Path) 
         return Err(changed());
     }
     let replaced: Vec<String> =
-        vertices.properties.iter().filter(|p| is_appended(&p.name)).map(|p| p.name.clone()).collect();
+        vertices.properties.iter().filter(|p| is_appended(columns, &p.name)).map(|p| p.name.clone()).collect();
     let fail = |e: std::io::Error| Error::write(destination, e);
     let mut out = BufWriter::with_capacity(1 << 20, File::create(destination).map_err(fail)?);
-    out.write_all(&new_header(&bytes, &header)?).map_err(fail)?;
+    out.write_all(&new_header(&bytes, &header, columns)?).map_err(fail)?;
     let points = PointOfRecord::new(source);
     match (header.encoding, vertices.stride(), place) {
         (Encoding::LittleEndian | Encoding::BigEndian, Some(stride), 0) => {
-            let kept = kept_ranges(vertices);
+            let kept = kept_ranges(vertices, columns);
             const RUN: usize = 16_384;
             let mut records = Vec::with_capacity(RUN * (stride + 32));
             let mut first = 0;
@@ -114,9 +125,9 @@ fn rewrite_one(source: &SourceFile, columns: &PointColumns, destination: &Path) 
                     line.clear();
                     let span = &data[row.span[0]..row.span[1]];
                     if header.encoding == Encoding::Ascii {
-                        keep_words(vertices, &row.lists, span, &mut line);
+                        keep_words(vertices, columns, &row.lists, span, &mut line);
                     } else {
-                        keep_bytes(vertices, &row.lists, span, &mut line);
+                        keep_bytes(vertices, columns, &row.lists, span, &mut line);
                     }
                     append(columns, points.get(record), header.encoding, &mut line);
                     record += 1;
@@ -140,7 +151,7 @@ fn rewrite_one(source: &SourceFile, columns: &PointColumns, destination: &Path) 
 }
 
 /// The source's header line by line, with the vertex properties changed.
-fn new_header(source: &SourceBytes, header: &Header) -> Result<Vec<u8>, Error> {
+fn new_header(source: &SourceBytes, header: &Header, columns: &PointColumns) -> Result<Vec<u8>, Error> {
     let raw = source.bytes(0, header.data_at as usize)?;
     let mut out = Vec::with_capacity(raw.len() + 128);
     let mut in_vertex = false;
@@ -151,14 +162,14 @@ fn new_header(source: &SourceBytes, header: &Header) -> Result<Vec<u8>, Error> {
         let (first, last) = (words.next(), words.next_back());
         let leaves = in_vertex && matches!(first, Some("element" | "end_header"));
         if leaves && !done {
-            for (kind, name) in APPENDED {
+            for (kind, name) in appended(columns) {
                 out.extend_from_slice(format!("property {kind} {name}\n").as_bytes());
             }
             done = true;
         }
         match first {
             Some("element") => in_vertex = text.split_whitespace().nth(1) == Some("vertex"),
-            Some("property") if in_vertex && last.is_some_and(is_appended) => continue,
+            Some("property") if in_vertex && last.is_some_and(|name| is_appended(columns, name)) => continue,
             _ => {}
         }
         out.extend_from_slice(line);
@@ -167,14 +178,14 @@ fn new_header(source: &SourceBytes, header: &Header) -> Result<Vec<u8>, Error> {
 }
 
 /// Byte ranges of a fixed-length record without the properties that are replaced.
-fn kept_ranges(vertices: &Element) -> Vec<std::ops::Range<usize>> {
+fn kept_ranges(vertices: &Element, columns: &PointColumns) -> Vec<std::ops::Range<usize>> {
     let mut ranges: Vec<std::ops::Range<usize>> = Vec::new();
     let mut at = 0;
     for property in &vertices.properties {
         let Kind::Scalar(scalar) = property.kind else { continue };
         let range = at..at + scalar.size();
         at = range.end;
-        if is_appended(&property.name) {
+        if is_appended(columns, &property.name) {
             continue;
         }
         match ranges.last_mut() {
@@ -186,12 +197,12 @@ fn kept_ranges(vertices: &Element) -> Vec<std::ops::Range<usize>> {
 }
 
 /// Copies the words of a text record that are kept, each followed by a blank.
-fn keep_words(vertices: &Element, lists: &[(usize, Vec<f64>)], span: &[u8], out: &mut Vec<u8>) {
+fn keep_words(vertices: &Element, columns: &PointColumns, lists: &[(usize, Vec<f64>)], span: &[u8], out: &mut Vec<u8>) {
     let mut words = span.split(u8::is_ascii_whitespace).filter(|w| !w.is_empty());
     for (place, property) in vertices.properties.iter().enumerate() {
         let items = lists.iter().find(|(p, _)| *p == place).map_or(0, |(_, items)| items.len());
         for word in words.by_ref().take(1 + items) {
-            if !is_appended(&property.name) {
+            if !is_appended(columns, &property.name) {
                 out.extend_from_slice(word);
                 out.push(b' ');
             }
@@ -200,7 +211,7 @@ fn keep_words(vertices: &Element, lists: &[(usize, Vec<f64>)], span: &[u8], out:
 }
 
 /// Copies the bytes of a binary record with lists that are kept.
-fn keep_bytes(vertices: &Element, lists: &[(usize, Vec<f64>)], span: &[u8], out: &mut Vec<u8>) {
+fn keep_bytes(vertices: &Element, columns: &PointColumns, lists: &[(usize, Vec<f64>)], span: &[u8], out: &mut Vec<u8>) {
     let mut at = 0;
     for (place, property) in vertices.properties.iter().enumerate() {
         let size = match property.kind {
@@ -210,7 +221,7 @@ fn keep_bytes(vertices: &Element, lists: &[(usize, Vec<f64>)], span: &[u8], out:
                 count.size() + items * item.size()
             }
         };
-        if !is_appended(&property.name) {
+        if !is_appended(columns, &property.name) {
             out.extend_from_slice(&span[at..at + size]);
         }
         at += size;
@@ -241,8 +252,8 @@ pub(in super::super) fn write_new(
         for (_, property) in named.iter().filter(|n| n.0) {
             writeln!(out, "property {property}")?;
         }
-        if columns.is_some() {
-            for (kind, name) in APPENDED {
+        if let Some(columns) = columns {
+            for (kind, name) in appended(columns) {
                 writeln!(out, "property {kind} {name}")?;
             }
         }

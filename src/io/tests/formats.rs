@@ -186,6 +186,7 @@ fn ply_text_with_lists_keeps_them_when_lifted() {
         chainage: &[1.5, f64::NAN],
         girth: &[2.0, f64::NAN],
         offset: &[0.25, f64::NAN],
+        surface_classes: None,
     };
     write_points(&cloud, &columns, &to).unwrap();
     let expected = text

@@ -265,7 +265,7 @@ fn a_changed_source_is_not_rewritten() {
     let (cloud, _) = read(&path);
     std::fs::write(&path, las(21)).unwrap();
     let (labels, [a, b, c]) = columns(20);
-    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c };
+    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c, surface_classes: None };
     let error = write_points(&cloud, &columns, &folder.path().join("b.las")).unwrap_err().to_string();
     assert!(error.contains("changed meanwhile"), "{error}");
 }

@@ -71,7 +71,8 @@ fn columns(n: usize) -> (Vec<u32>, [Vec<f64>; 3]) {
 fn lift(from: &Path, to: &Path) -> (Cloud, WriteSummary) {
     let (cloud, _) = read(from);
     let (labels, [chainage, girth, offset]) = columns(cloud.len());
-    let columns = PointColumns { labels: &labels, chainage: &chainage, girth: &girth, offset: &offset };
+    let columns =
+        PointColumns { labels: &labels, chainage: &chainage, girth: &girth, offset: &offset, surface_classes: None };
     let summary = write_points(&cloud, &columns, to).unwrap();
     (cloud, summary)
 }
@@ -104,6 +105,39 @@ fn lifted_files_keep_everything_and_take_the_new_labels() {
 }
 
 #[test]
+fn surface_classes_are_a_column_of_their_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let cloud = cloud(1000);
+    let classes: Vec<u8> = (0..1000).map(|i| if i % 7 == 0 { NO_CLASS } else { (i % 5) as u8 }).collect();
+    for name in ["las", "laz", "ply"] {
+        let [from, with, without] = ["a", "b", "c"].map(|stem| folder.path().join(format!("{stem}.{name}")));
+        write_cloud(&cloud, None, &from).unwrap();
+        let (read_back, _) = read(&from);
+        let (labels, [chainage, girth, offset]) = columns(1000);
+        let mut columns = PointColumns {
+            labels: &labels,
+            chainage: &chainage,
+            girth: &girth,
+            offset: &offset,
+            surface_classes: Some(&classes),
+        };
+        write_points(&read_back, &columns, &with).unwrap();
+        let as_labels = |path: &Path| {
+            let settings = Settings { label_column: Some("surface_class".into()), ..Settings::default() };
+            read_cloud(&[path.to_owned()], &settings).map(|(cloud, _)| cloud.attributes().labels.clone().unwrap())
+        };
+        let expected: Vec<u32> = classes.iter().map(|&c| u32::from(c)).collect();
+        assert_eq!(as_labels(&with).unwrap(), expected, "{name}");
+        // The classification of the file is not touched, and a writer that knows no classes leaves the column alone.
+        assert_eq!(read(&with).0.attributes().classifications, cloud.attributes().classifications);
+        columns.surface_classes = None;
+        write_points(&read(&with).0, &columns, &without).unwrap();
+        assert_eq!(as_labels(&without).unwrap(), expected, "{name}");
+        assert!(as_labels(&from).is_err());
+    }
+}
+
+#[test]
 fn several_files_are_one_scan() {
     let folder = tempfile::tempdir().unwrap();
     let paths: Vec<PathBuf> = ["a.las", "b.laz"].iter().map(|n| folder.path().join(n)).collect();
@@ -115,7 +149,7 @@ fn several_files_are_one_scan() {
     assert_eq!(both.positions()[..1000], both.positions()[1000..]);
     let (labels, [a, b, c]) = columns(2000);
     let to = folder.path().join("c.laz");
-    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c };
+    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c, surface_classes: None };
     assert_eq!(write_points(&both, &columns, &to).unwrap().points, 2000);
     assert_eq!(read(&to).0.attributes().labels, Some(labels));
 }
@@ -152,6 +186,7 @@ fn meshes_read_back_in_their_frame() {
         faces: &faces,
         observed_vertices: Some(&[true, true, true, false]),
         observed_faces: Some(&[true, false]),
+        quality: None,
     };
     ply::write_mesh(&mesh, &path).unwrap();
     let (back, summary) = ply::read_chart(&path).unwrap();
