@@ -1,6 +1,7 @@
 #!/bin/sh
 # Makes the tables and pictures of docs/methods/comparison.md again, with the program, from tunnels of its own generator.
-# Takes a few minutes; the figures of time and memory are those of the machine it runs on.
+# Takes a few minutes; needs Python 3 with Pillow for the palette of the pictures only. The figures of
+# time and memory are those of the machine it runs on.
 set -eu
 cd "$(dirname "$0")/.."
 work=${1:-$(mktemp -d)}
@@ -26,11 +27,19 @@ adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/ben
 adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/curve" --methods \
     section,arap,relax:straightness=0,relax:straightness=0.1,relax:straightness=0.25,relax:straightness=0.5,relax:straightness=0.75,relax:straightness=0.9,relax:straightness=1
 
-cp "$work/tunnel/comparison.png" docs/pictures/comparison.png
 cp "$work/tunnel/comparison.csv" docs/methods/comparison.csv
-cp "$work/bend/comparison.png" docs/pictures/comparison_bend.png
 cp "$work/bend/comparison.csv" docs/methods/comparison_bend.csv
 cp "$work/curve/comparison.csv" docs/methods/comparison_straightness.csv
+
+# A small palette keeps the pictures small.
+python3 - "$work/tunnel/comparison.png" docs/pictures/comparison.png "$work/bend/comparison.png" docs/pictures/comparison_bend.png <<'PYTHON'
+import sys
+from PIL import Image
+
+for source, target in zip(sys.argv[1::2], sys.argv[2::2]):
+    small = Image.open(source).convert("RGB").quantize(48, dither=Image.Dither.NONE)
+    small.save(target, optimize=True)
+PYTHON
 
 # The tables go between their markers in the page.
 for name in tunnel coarse bend curve; do

@@ -13,7 +13,7 @@ use std::path::Path;
 use tiny_skia::{Color, Paint, Pixmap, Rect, Transform};
 
 /// Width of one map at the common scale, pixels.
-const PANEL: f64 = 560.0;
+const PANEL: f64 = 740.0;
 /// Space around the maps, pixels.
 const MARGIN: f64 = 24.0;
 /// Height of the legend and of the captions above each pair of maps, pixels.
