@@ -38,6 +38,18 @@ pub struct Arguments {
 
 /// Chainage, girth and offset are stored in micrometres; on a stretched face that is a few micrometres in space.
 const POINT_M: f64 = 1e-5;
+/// A place, and its neighbours a micrometre away.
+const ROUNDING: [(f64, f64); 9] = [
+    (0.0, 0.0),
+    (1e-6, 0.0),
+    (-1e-6, 0.0),
+    (0.0, 1e-6),
+    (0.0, -1e-6),
+    (1e-6, 1e-6),
+    (1e-6, -1e-6),
+    (-1e-6, 1e-6),
+    (-1e-6, -1e-6),
+];
 const PIXEL_PX: f64 = 0.01;
 const LINE_M: f64 = 0.001;
 /// Pixels whose content may differ from what the chart says, share: those whose centre lies on an edge.
@@ -153,7 +165,9 @@ fn points(file: &Path, surface: &RunSurface, index: &ChartIndex, anchoring: &Anc
                     continue;
                 }
             }
-            match index.surface_point(point.on_map.xy()) {
+            // Rounding to micrometres takes places at the border of the map over it.
+            let near = ROUNDING.iter().find_map(|(u, v)| index.surface_point(point.on_map.xy() + Vec2::new(*u, *v)));
+            match near {
                 Some(foot) => {
                     let back = SurfacePoint { offset: point.on_map.z, ..foot };
                     errors.push((back.position(anchoring.mesh(), anchoring.normals()) - p).norm());

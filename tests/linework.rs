@@ -1,0 +1,161 @@
+//! Linework through the real program: map to wall and back at the coordinates of a national grid, in all formats.
+
+use adit::io::vector::{self, Shapes, Space};
+use adit::linework::{Feature, Kind, Value};
+use adit::numeric::Vec3;
+use assert_cmd::Command;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+fn adit(arguments: &[&str]) -> Output {
+    Command::cargo_bin("adit").unwrap().args(arguments).output().unwrap()
+}
+
+fn told(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout)
+}
+
+fn done(arguments: &[&str]) -> String {
+    let output = adit(arguments);
+    assert!(output.status.success(), "{arguments:?}: {}", told(&output));
+    told(&output)
+}
+
+fn path(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+/// A small run at northing 6 010 935.
+fn run(folder: &Path) -> PathBuf {
+    let (scan, run) = (folder.join("scan.laz"), folder.join("run"));
+    let options = ["--length", "10", "--points", "40000", "--furniture", "none", "--origin", "244398,6010935,18"];
+    done(&[&["synth", "--out", path(&scan)], &options[..]].concat());
+    let output = adit(&["run", "--input", path(&scan), "--out", path(&run), "--quiet", "--set", "map.cell_m=0.04"]);
+    assert!(matches!(output.status.code(), Some(0 | 5)), "{}", told(&output));
+    run
+}
+
+fn line(id: i64, part: Vec<Vec3>) -> Feature {
+    let attributes =
+        vec![("kind".to_owned(), Value::Text("joint".into())), ("aperture_m".to_owned(), Value::Real(0.25))];
+    Feature { class: "traces".into(), id: Some(id), attributes, kind: Kind::Line, parts: vec![part] }
+}
+
+fn distance(p: &Vec3, lines: &[Vec<Vec3>]) -> f64 {
+    let segment = |w: &[Vec3]| {
+        let d = w[1] - w[0];
+        let t = if d.norm_squared() > 0.0 { ((p - w[0]).dot(&d) / d.norm_squared()).clamp(0.0, 1.0) } else { 0.0 };
+        (p - w[0] - d * t).norm()
+    };
+    lines.iter().flat_map(|l| l.windows(2)).map(segment).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn linework_returns_within_a_millimetre_in_every_format() {
+    let place = tempfile::tempdir().unwrap();
+    let run = run(place.path());
+    let file = |name: &str| place.path().join(name);
+    // On the map: a line along, a line across the crown, a short one.
+    let drawn = [
+        line(11, vec![Vec3::new(1.0, 0.5, 0.0), Vec3::new(8.5, 1.4, 0.0)]),
+        line(12, vec![Vec3::new(3.0, -3.0, 0.0), Vec3::new(4.1, 0.2, 0.0), Vec3::new(3.5, 3.2, 0.0)]),
+        line(40, vec![Vec3::new(6.0, -2.0, 0.0), Vec3::new(6.2, -2.1, 0.0)]),
+    ];
+    vector::write(&file("drawn.gpkg"), &[Shapes { space: Space::Map, features: &drawn }]).unwrap();
+    for name in ["gpkg", "geojson", "dxf", "shp"] {
+        let (up, back) = (file(&format!("up.{name}")), file(&format!("back.{name}")));
+        done(&["drape", path(&run), "--in", path(&file("drawn.gpkg")), "--out", path(&up)]);
+        done(&["flatten", path(&run), "--in", path(&up), "--out", path(&back)]);
+        let wall = vector::read(&up, Space::Scan).unwrap().features;
+        let again = vector::read(&back, Space::Map).unwrap().features;
+        assert_eq!((wall.len(), again.len()), (3, 3), "{name}");
+        for (before, (on_wall, after)) in drawn.iter().zip(wall.iter().zip(&again)) {
+            assert_eq!((before.id, before.id), (on_wall.id, after.id), "{name}");
+            assert_eq!(after.attribute("kind"), Some(&Value::Text("joint".into())), "{name}");
+            // The wall is bent: many vertices, all of them near northing 6 010 935.
+            let vertices: usize = on_wall.parts.iter().map(Vec::len).sum();
+            assert!(vertices > 5, "{name}: {vertices}");
+            assert!(on_wall.parts.iter().flatten().all(|p| (p.y - 6_010_935.0).abs() < 50.0), "{name}");
+            let worst = after.parts.iter().flatten().map(|p| distance(p, &before.parts)).fold(0.0, f64::max);
+            let missed = before.parts[0].iter().map(|p| distance(p, &after.parts)).fold(0.0, f64::max);
+            assert!(worst < 1e-3 && missed < 1e-3, "{name}: {worst} {missed}");
+        }
+    }
+}
+
+#[test]
+fn bolts_keep_their_offset_and_what_is_lost_is_told() {
+    let place = tempfile::tempdir().unwrap();
+    let run = run(place.path());
+    let file = |name: &str| place.path().join(name);
+    let wall = [
+        line(1, vec![Vec3::new(4.0, 1.0, 0.0), Vec3::new(4.1, 1.0, 0.0)]),
+        line(2, vec![Vec3::new(-50.0, 1.0, 0.0), Vec3::new(-40.0, 1.0, 0.0)]),
+    ];
+    vector::write(&file("collars.gpkg"), &[Shapes { space: Space::Map, features: &wall }]).unwrap();
+    let warning = done(&["drape", path(&run), "--in", path(&file("collars.gpkg")), "--out", path(&file("up.gpkg"))]);
+    assert!(warning.contains("traces 2 was left out"), "{warning}");
+    let collar = vector::read(&file("up.gpkg"), Space::Scan).unwrap().features[0].parts[0][0];
+    // A bolt of 3 m into the rock, upwards and aside.
+    let bolt = line(7, vec![collar, collar + Vec3::new(0.6, 0.4, 2.9)]);
+    vector::write(&file("bolt.geojson"), &[Shapes { space: Space::Scan, features: std::slice::from_ref(&bolt) }])
+        .unwrap();
+    done(&["flatten", path(&run), "--in", path(&file("bolt.geojson")), "--out", path(&file("bolt.gpkg"))]);
+    done(&["drape", path(&run), "--in", path(&file("bolt.gpkg")), "--out", path(&file("again.gpkg"))]);
+    let again = &vector::read(&file("again.gpkg"), Space::Scan).unwrap().features[0];
+    assert_eq!((again.id, again.parts.len(), again.parts[0].len()), (Some(7), 1, 2));
+    for (a, b) in bolt.parts[0].iter().zip(&again.parts[0]) {
+        assert!((a - b).norm() < 1e-3, "{a} {b}");
+    }
+    let output = adit(&["drape", path(&run), "--in", path(&file("none.gpkg")), "--out", path(&file("x.gpkg"))]);
+    assert_eq!(output.status.code(), Some(3), "{}", told(&output));
+}
+
+/// Other programs read what is written: fiona or geopandas, and ezdxf, when Python has them.
+#[test]
+fn files_open_in_other_programs() {
+    let python = std::env::var("ADIT_PYTHON").unwrap_or_else(|_| "python3".into());
+    let has = |module: &str| {
+        std::process::Command::new(&python)
+            .args(["-c", &format!("import {module}")])
+            .output()
+            .is_ok_and(|o| o.status.success())
+    };
+    let missing: Vec<&str> = ["pyogrio", "ezdxf"].into_iter().filter(|m| !has(m)).collect();
+    if !missing.is_empty() {
+        eprintln!("NOT CHECKED: {python} has no {}; set ADIT_PYTHON to a Python that has them", missing.join(", "));
+        return;
+    }
+    let place = tempfile::tempdir().unwrap();
+    let file = |name: &str| place.path().join(name);
+    let far = |x: f64, z: f64| Vec3::new(244_398.0 + x, 6_010_935.0 + x, z);
+    let features =
+        [line(3, vec![far(0.0, 1.0), far(2.0, 1.5)]), line(8, vec![far(1.0, 1.0), far(3.0, 2.5), far(4.0, 2.0)])];
+    let shapes =
+        [Shapes { space: Space::Scan, features: &features }, Shapes { space: Space::Map, features: &features }];
+    for name in ["a.gpkg", "a.dxf", "a.shp", "a.geojson"] {
+        vector::write(&file(name), &shapes).unwrap();
+    }
+    let script = r#"
+import sys, ezdxf, pyogrio
+folder = sys.argv[1]
+layers = dict(pyogrio.list_layers(folder + "/a.gpkg"))
+assert set(layers) == {"traces_map", "traces_scan"}, layers
+for layer in layers:
+    info = pyogrio.read_info(folder + "/a.gpkg", layer=layer, force_total_bounds=True)
+    assert info["features"] == 2 and list(info["fields"]) == ["kind", "aperture_m"], info
+    assert info["geometry_type"] in ("LineString Z", "2.5D LineString"), info
+    assert max(abs(a - b) for a, b in zip(info["total_bounds"], (244398, 6010935, 244402, 6010939))) < 1e-6, info
+for name in ("a.shp", "a.geojson"):
+    assert pyogrio.read_info(folder + "/" + name)["features"] == 2, name
+document = ezdxf.readfile(folder + "/a.dxf")
+audit = document.audit()
+assert not audit.errors and not audit.fixes, (audit.errors, audit.fixes)
+lines = list(document.modelspace().query("POLYLINE"))
+assert len(lines) == 2 and all(l.is_3d_polyline for l in lines)
+assert [tuple(v) for v in lines[0].points()][1] == (244400.0, 6010937.0, 1.5)
+print("fine")
+"#;
+    let output = std::process::Command::new(&python).args(["-c", script, path(place.path())]).output().unwrap();
+    assert!(output.status.success(), "{}", told(&output));
+}
