@@ -60,7 +60,7 @@ fn opened(axis: &Axis, faces: usize) -> Strip {
 
 fn flatten(criterion: &mut Criterion) {
     let axis = axis();
-    for method in ["section", "relax", "lscm", "arap"] {
+    for method in ["section", "relax", "lscm", "abf++", "arap", "slim"] {
         let mut group = criterion.benchmark_group(method);
         for (name, faces) in sizes() {
             let strip = opened(&axis, faces);

@@ -24,12 +24,16 @@ pub enum Error {
     #[error("the mesh has no faces")]
     Empty,
     /// More than one connected component.
-    #[error("the mesh falls into {components} components; keep one (the largest has {largest} faces)")]
+    #[error(
+        "the mesh falls into {components} components; keep one (the largest has {largest} faces; face {stray} is not of it)"
+    )]
     Components {
         /// How many components.
         components: usize,
         /// Faces of the largest.
         largest: usize,
+        /// The first face of another one.
+        stray: u32,
     },
     /// No boundary: a closed surface cannot be flattened without a cut.
     #[error("the mesh is closed: it needs a cut before it can be flattened")]
@@ -84,7 +88,9 @@ impl Strip {
         if count > 1 {
             let mut sizes = vec![0usize; count];
             component.iter().for_each(|&c| sizes[c as usize] += 1);
-            return Err(Error::Components { components: count, largest: sizes.into_iter().max().unwrap_or(0) });
+            let largest = (0..count).rev().max_by_key(|&c| sizes[c]).unwrap_or(0);
+            let stray = component.iter().position(|&c| c as usize != largest).unwrap_or(0) as u32;
+            return Err(Error::Components { components: count, largest: sizes[largest], stray });
         }
         let mut loops = topology::boundary_loops(mesh.faces(), &twin);
         if loops.is_empty() {

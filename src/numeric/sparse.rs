@@ -12,11 +12,14 @@ use std::sync::Arc;
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::LltRegularization;
+use faer::perm::PermRef;
+use faer::sparse::linalg::amd;
 use faer::sparse::linalg::cholesky::{
     CholeskySymbolicParams, LltRef, SymbolicCholesky, SymmetricOrdering, factorize_symbolic_cholesky,
 };
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMatRef};
 use faer::{Conj, MatMut, Par, Side, Spec};
+use rayon::prelude::*;
 
 /// Why a sparse system was not solved.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -277,6 +280,65 @@ impl Pattern {
         if scale == 0.0 { r } else { r / scale }
     }
 
+    /// An elimination order with the same fill as `order` in which every subtree of the elimination tree is contiguous, as
+    /// a supernodal factorization wants it (J. W. H. Liu, "The role of elimination trees in sparse factorization", SIAM
+    /// Journal on Matrix Analysis and Applications 11(1), 1990, doi:10.1137/0611010).
+    fn postordered(&self, order: &[u32]) -> Vec<u32> {
+        const NONE: u32 = u32::MAX;
+        let n = order.len();
+        let mut place = vec![0u32; n];
+        order.iter().enumerate().for_each(|(k, &i)| place[i as usize] = k as u32);
+        // For each unknown, in the new order, its earlier neighbours in compressed rows.
+        let pairs = || {
+            (0..n).flat_map(|j| self.column(j)[1..].iter().map(move |&i| (i, j))).map(|(i, j)| {
+                let (a, b) = (place[i as usize], place[j]);
+                (a.max(b), a.min(b))
+            })
+        };
+        let mut start = vec![0u32; n + 1];
+        pairs().for_each(|(late, _)| start[late as usize + 1] += 1);
+        for k in 0..n {
+            start[k + 1] += start[k];
+        }
+        let mut fill = start.clone();
+        let mut earlier = vec![0u32; start[n] as usize];
+        pairs().for_each(|(late, early)| {
+            earlier[fill[late as usize] as usize] = early;
+            fill[late as usize] += 1;
+        });
+        let (mut parent, mut ancestor) = (vec![NONE; n], vec![NONE; n]);
+        for k in 0..n {
+            for &from in &earlier[start[k] as usize..start[k + 1] as usize] {
+                let mut i = from;
+                while i != NONE && (i as usize) < k {
+                    let next = std::mem::replace(&mut ancestor[i as usize], k as u32);
+                    if next == NONE {
+                        parent[i as usize] = k as u32;
+                    }
+                    i = next;
+                }
+            }
+        }
+        // Children of each unknown, first to last; the roots hang on one more.
+        let (mut first, mut sibling) = (vec![NONE; n + 1], vec![NONE; n]);
+        for k in (0..n).rev() {
+            let above = if parent[k] == NONE { n } else { parent[k] as usize };
+            sibling[k] = std::mem::replace(&mut first[above], k as u32);
+        }
+        let mut result = Vec::with_capacity(n);
+        let mut path: Vec<u32> = Vec::new();
+        let mut next = first[n];
+        loop {
+            while next != NONE {
+                path.push(next);
+                next = std::mem::replace(&mut first[next as usize], NONE);
+            }
+            let Some(done) = path.pop() else { return result };
+            result.push(order[done as usize]);
+            next = sibling[done as usize];
+        }
+    }
+
     fn as_faer(&self) -> SymbolicSparseColMatRef<'_, u32> {
         let n = self.unknowns();
         SymbolicSparseColMatRef::new_checked(n, n, &self.starts, None, &self.rows)
@@ -303,6 +365,34 @@ impl Analysis {
             CholeskySymbolicParams::default(),
         )
         .map_err(|_| Error::OutOfMemory { unknowns })?;
+        Ok(Self { symbolic: Arc::new(symbolic) })
+    }
+
+    /// Analyses a pattern with two interleaved unknowns a node, such as [`Pattern::two_per_node`], by the AMD ordering of its
+    /// nodes: half the unknowns and a quarter of the entries to order, and the same fill where the two unknowns of a node
+    /// have the same neighbours.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`].
+    pub fn of_paired(nodes: &Pattern, pattern: &Pattern) -> Result<Self, Error> {
+        let unknowns = pattern.unknowns();
+        let n = nodes.unknowns();
+        assert_eq!(unknowns, 2 * n);
+        let no_memory = || Error::OutOfMemory { unknowns };
+        let (mut forward, mut inverse) = (vec![0u32; n], vec![0u32; n]);
+        let need = amd::order_maybe_unsorted_scratch::<u32>(n, nodes.entries());
+        let mut memory = MemBuffer::try_new(need).map_err(|_| no_memory())?;
+        let stack = MemStack::new(&mut memory);
+        amd::order_maybe_unsorted(&mut forward, &mut inverse, nodes.as_faer(), amd::Control::default(), stack)
+            .map_err(|_| no_memory())?;
+        drop(memory);
+        let pairs: Vec<u32> = forward.iter().flat_map(|&p| [2 * p, 2 * p + 1]).collect();
+        let order = pattern.postordered(&pairs);
+        let mut place = vec![0u32; unknowns];
+        order.iter().enumerate().for_each(|(k, &i)| place[i as usize] = k as u32);
+        let ordering = SymmetricOrdering::Custom(PermRef::new_checked(&order, &place, unknowns));
+        let symbolic = factorize_symbolic_cholesky(pattern.as_faer(), Side::Lower, ordering, Default::default())
+            .map_err(|_| no_memory())?;
         Ok(Self { symbolic: Arc::new(symbolic) })
     }
 
@@ -374,18 +464,20 @@ impl Cholesky {
         self.analysis.symbolic.nrows()
     }
 
-    /// Replaces right-hand sides (column after column) by solutions. Panics if the length is no multiple of the unknowns.
+    /// Replaces right-hand sides (column after column) by solutions, each column on its own, so that they do not depend on
+    /// each other or on the number of threads. Panics if the length is no multiple of the unknowns.
     pub fn solve_in_place(&self, right: &mut [f64]) {
         let n = self.unknowns();
         assert!(n > 0 && right.len().is_multiple_of(n));
-        let columns = right.len() / n;
-        let mut memory = MemBuffer::new(self.analysis.symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq));
-        LltRef::<u32, f64>::new(&self.analysis.symbolic, &self.factor).solve_in_place_with_conj(
-            Conj::No,
-            MatMut::from_column_major_slice_mut(right, n, columns),
-            Par::Seq,
-            MemStack::new(&mut memory),
-        );
+        right.par_chunks_mut(n).for_each(|column| {
+            let mut memory = MemBuffer::new(self.analysis.symbolic.solve_in_place_scratch::<f64>(1, Par::Seq));
+            LltRef::<u32, f64>::new(&self.analysis.symbolic, &self.factor).solve_in_place_with_conj(
+                Conj::No,
+                MatMut::from_column_major_slice_mut(column, n, 1),
+                Par::Seq,
+                MemStack::new(&mut memory),
+            );
+        });
     }
 
     /// Solves for one right-hand side, with one step of iterative refinement: half the digits that a badly conditioned
@@ -452,6 +544,33 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn an_order_of_nodes_serves_their_pairs() {
+        let n = 40u32;
+        let nodes = Pattern::of_vertices((n * n) as usize, &grid(n)).unwrap();
+        let pattern = nodes.two_per_node().unwrap();
+        // Diagonally dominant: positive definite whatever the signs.
+        let mut values: Vec<f64> = (0..pattern.entries()).map(|s| (s as f64 * 0.7).sin()).collect();
+        for j in 0..pattern.unknowns() {
+            values[pattern.diagonal(j)] = 40.0;
+        }
+        let truth: Vec<f64> = (0..pattern.unknowns()).map(|i| (i as f64 * 0.37).cos()).collect();
+        let right = pattern.multiply(&values, &truth);
+        let analysis = Analysis::of_paired(&nodes, &pattern).unwrap();
+        let mut x = right;
+        Cholesky::new(&pattern, &analysis, &values).unwrap().solve_in_place(&mut x);
+        assert!(x.iter().zip(&truth).all(|(a, b)| (a - b).abs() < 1e-12));
+        let plain = Analysis::new(&pattern).unwrap();
+        assert!((analysis.factor_entries() as f64) < 1.2 * plain.factor_entries() as f64);
+    }
+
+    #[test]
+    fn a_postorder_is_a_permutation_with_subtrees_together() {
+        // A path 0-2-4-1-3 eliminated as 0, 1, 2, 3, 4: 0 -> 2, 1 -> 3, 3 -> 4, 2 -> 4.
+        let pattern = Pattern::of_pairs(5, || [(0, 2), (2, 4), (4, 1), (1, 3)].into_iter()).unwrap();
+        assert_eq!(pattern.postordered(&[0, 1, 2, 3, 4]), [0, 2, 1, 3, 4]);
     }
 
     #[test]

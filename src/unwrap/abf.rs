@@ -21,10 +21,9 @@
 use super::angles::{AngleProblem, FREE, lay_out};
 use super::guide::Guide;
 use super::triangle_shapes::Shapes;
-use super::{Error, SolveSummary};
+use super::{Error, SolveSummary, stopping};
 use crate::cut::Strip;
 use crate::numeric::Vec2;
-use crate::warning::Warning;
 use faer::linalg::solvers::Solve;
 use faer::sparse::{SparseColMat, Triplet};
 use schemars::JsonSchema;
@@ -55,9 +54,7 @@ impl Default for Settings {
 /// # Errors
 /// [`Error::Solve`] when the mesh is too large, a system cannot be solved or the layout has no area; [`Error::Setting`].
 pub fn flatten(strip: &Strip, _guide: Option<&Guide>, settings: &Settings) -> Result<(Vec<Vec2>, SolveSummary), Error> {
-    if !(settings.tolerance > 0.0) {
-        return Err(Error::Setting { key: "abf.tolerance", value: settings.tolerance, must: "more than 0" });
-    }
+    stopping::positive("abf.tolerance", settings.tolerance)?;
     let count = strip.mesh().faces().len();
     if count > settings.max_faces {
         let what = format!(
@@ -167,18 +164,7 @@ fn newton(problem: &AngleProblem, settings: &Settings, summary: &mut SolveSummar
         summary.converged = misfit.largest() <= settings.tolerance && largest <= 1000.0 * settings.tolerance;
     }
     summary.energy = Some(problem.energy(&angles));
-    if !summary.converged {
-        summary.warnings.push(Warning::new(
-            "not-converged",
-            format!(
-                "abf did not converge in {} iterations: conditions off by {:.1e} (wanted {:e}); the map is laid out from the \
-                 angles reached",
-                summary.iterations,
-                summary.residual.unwrap_or(f64::NAN),
-                settings.tolerance
-            ),
-        ));
-    }
+    stopping::warn_of_misfit("abf", settings.tolerance, summary);
     Ok(angles)
 }
 

@@ -17,26 +17,32 @@
 //! Each iteration is a Newton step of the Lagrangian with the Hessian of the energy (the second derivatives of `C` are left
 //! out, as in the paper). Angles and face conditions are eliminated face by face, which leaves
 //! `(sum_t J_t P_t J_t^T) lambda = C + J P w (phi - alpha)`: positive definite, two unknowns an inner vertex, one 2x2 block
-//! an edge. The pattern is made and analysed once.
+//! an edge. The pattern is made and analysed once. The matrix changes little between iterations, so the factor of an
+//! earlier one preconditions conjugate gradients until that takes too many steps.
 //!
 //! Guarantees: when it converges, the fixed point is that of the full problem (the same as `abf`), and the layout has the
 //! angles to the tolerance. When it does not, that is told and the best angles so far are laid out; nothing else is tried.
 //! Departures: `C_len` is the difference of logarithms instead of products, the same set with a better scaled Jacobian;
 //! steps are shortened where an angle would leave (0, pi) instead of raising its weight.
 //! Layout: least squares conformal with the cotangents of the found angles (shared with `lscm`), then the surface's area.
-//! Cost: one factorization with two unknowns a vertex an iteration (5 to 8 of them), and one for the layout.
+//! Cost: one or two factorizations with two unknowns a vertex, a few solves an iteration, and a factorization for the layout.
 
 use super::angles::{AngleProblem, FREE, lay_out};
 use super::guide::Guide;
 use super::triangle_shapes::Shapes;
-use super::{Error, SolveSummary};
+use super::{Error, SolveSummary, stopping};
 use crate::cut::Strip;
-use crate::numeric::Vec2;
 use crate::numeric::sparse::{self, Analysis, Cholesky, Pattern};
-use crate::warning::Warning;
+use crate::numeric::{Vec2, conjugate_gradients};
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
+
+/// The linear solve with an old factor stops at this share of its first residual.
+const SOLVE_SHARE: f64 = 1e-3;
+/// More steps than this with an old factor cost more than a new one.
+const MOST_STEPS: usize = 8;
 
 /// How angles are flattened.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -60,9 +66,7 @@ impl Default for Settings {
 /// # Errors
 /// [`Error::Solve`] when a system cannot be solved or the layout has no area, [`Error::Setting`].
 pub fn flatten(strip: &Strip, _guide: Option<&Guide>, settings: &Settings) -> Result<(Vec<Vec2>, SolveSummary), Error> {
-    if !(settings.tolerance > 0.0) {
-        return Err(Error::Setting { key: "abf++.tolerance", value: settings.tolerance, must: "more than 0" });
-    }
+    stopping::positive("abf++.tolerance", settings.tolerance)?;
     let shapes = Shapes::of(strip.mesh());
     let problem = AngleProblem::new(strip.mesh(), &shapes);
     let mut summary = SolveSummary::default();
@@ -91,23 +95,15 @@ fn newton(
         })
     };
     let nodes = Pattern::of_pairs(problem.inner_count, edges)?;
-    let pattern = nodes.two_per_node()?;
-    let analysis = Analysis::new(&pattern)?;
-    let mut factor: Option<Cholesky> = None;
-    let mut values = vec![0.0; pattern.entries()];
+    let mut solver = ReducedSolver::new(&nodes)?;
     let mut residuals = problem.residuals(&angles);
     summary.figures.insert("shortened_steps".to_owned(), 0.0);
     while summary.iterations < settings.max_iterations && !summary.converged {
-        let mut right = residuals.clone();
-        assemble(problem, &angles, &nodes, &mut values, &mut right);
-        match &mut factor {
-            Some(f) => f.refactor(&pattern, &values)?,
-            None => factor = Some(Cholesky::new(&pattern, &analysis, &values)?),
-        }
-        if let Some(f) = &factor {
-            f.solve_in_place(&mut right);
-        }
-        let step = angle_step(problem, &angles, &right);
+        let cotangents: Vec<[f64; 3]> = angles.par_iter().map(|a| a.map(|x| x.cos() / x.sin())).collect();
+        let mut right = residuals;
+        assemble(problem, &angles, &cotangents, &nodes, &mut solver.values, &mut right);
+        let multipliers = solver.solve(right)?;
+        let step = angle_step(problem, &angles, &cotangents, &multipliers);
         let share = problem.longest_step(&angles, &step);
         if share < 1.0 {
             *summary.figures.entry("shortened_steps".to_owned()).or_default() += 1.0;
@@ -125,19 +121,65 @@ fn newton(
         summary.converged = misfit.largest() <= settings.tolerance && largest <= 1000.0 * settings.tolerance;
     }
     summary.energy = Some(problem.energy(&angles));
-    if !summary.converged {
-        summary.warnings.push(Warning::new(
-            "not-converged",
-            format!(
-                "abf++ did not converge in {} iterations: conditions off by {:.1e} (wanted {:e}); the map is laid out from \
-                 the angles reached",
-                summary.iterations,
-                summary.residual.unwrap_or(f64::NAN),
-                settings.tolerance
-            ),
-        ));
-    }
+    summary.figures.insert("factorizations".to_owned(), solver.factorizations as f64);
+    summary.figures.insert("linear_steps".to_owned(), solver.steps as f64);
+    stopping::warn_of_misfit("abf++", settings.tolerance, summary);
     Ok(angles)
+}
+
+/// The reduced system. Its matrix changes little from step to step, so an old factor serves as preconditioner until it
+/// needs too many steps.
+struct ReducedSolver {
+    pattern: Pattern,
+    analysis: Analysis,
+    values: Vec<f64>,
+    factor: Option<Cholesky>,
+    /// The multipliers of the step before.
+    last: Vec<f64>,
+    factorizations: usize,
+    /// Conjugate gradient steps so far.
+    steps: usize,
+}
+
+impl ReducedSolver {
+    fn new(nodes: &Pattern) -> Result<Self, sparse::Error> {
+        let pattern = nodes.two_per_node()?;
+        let analysis = Analysis::of_paired(nodes, &pattern)?;
+        let values = vec![0.0; pattern.entries()];
+        Ok(Self { pattern, analysis, values, factor: None, last: Vec::new(), factorizations: 0, steps: 0 })
+    }
+
+    fn solve(&mut self, mut right: Vec<f64>) -> Result<Vec<f64>, sparse::Error> {
+        if let Some(old) = &self.factor {
+            let precondition = |r: &[f64]| {
+                let mut x = r.to_vec();
+                old.solve_in_place(&mut x);
+                x
+            };
+            let multiply = |x: &[f64]| self.pattern.multiply(&self.values, x);
+            // The multipliers settle like the angles, so only their change has to be found.
+            let mut rest = multiply(&self.last);
+            rest.iter_mut().zip(&right).for_each(|(r, b)| *r = b - *r);
+            let outcome = conjugate_gradients::solve(multiply, precondition, &rest, SOLVE_SHARE, MOST_STEPS);
+            self.steps += outcome.steps;
+            if outcome.converged {
+                self.last.iter_mut().zip(&outcome.x).for_each(|(x, d)| *x += d);
+                return Ok(self.last.clone());
+            }
+        }
+        self.factorizations += 1;
+        let factor = match self.factor.take() {
+            Some(mut factor) => {
+                factor.refactor(&self.pattern, &self.values)?;
+                factor
+            }
+            None => Cholesky::new(&self.pattern, &self.analysis, &self.values)?,
+        };
+        factor.solve_in_place(&mut right);
+        self.factor = Some(factor);
+        self.last.clone_from(&right);
+        Ok(right)
+    }
 }
 
 /// `P_t x` for one face: the inverse of the weights on steps that sum to zero.
@@ -155,13 +197,20 @@ fn free_step(angles: &[f64; 3], target: &[f64; 3], inverse: &[f64; 3]) -> [f64; 
 }
 
 /// Fills the matrix and completes the right-hand side, which comes with `C`.
-fn assemble(problem: &AngleProblem, angles: &[[f64; 3]], nodes: &Pattern, values: &mut [f64], right: &mut [f64]) {
+fn assemble(
+    problem: &AngleProblem,
+    angles: &[[f64; 3]],
+    cotangents: &[[f64; 3]],
+    nodes: &Pattern,
+    values: &mut [f64],
+    right: &mut [f64],
+) {
     values.fill(0.0);
     for (t, corners) in problem.faces.iter().enumerate() {
         let inner = corners.map(|v| problem.inner[v as usize]);
         let inverse = problem.weight[t].map(|w| 1.0 / w);
         let free = free_step(&angles[t], &problem.target[t], &inverse);
-        let gradients: [[[f64; 3]; 2]; 3] = std::array::from_fn(|k| AngleProblem::gradients(&angles[t], k));
+        let gradients: [[[f64; 3]; 2]; 3] = std::array::from_fn(|k| AngleProblem::gradients(&cotangents[t], k));
         let projected = gradients.map(|g| g.map(|g| project(&inverse, &g)));
         let dot = |a: &[f64; 3], b: &[f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
         for a in 0..3 {
@@ -189,7 +238,12 @@ fn assemble(problem: &AngleProblem, angles: &[[f64; 3]], nodes: &Pattern, values
 }
 
 /// The step of all angles, given the multipliers.
-fn angle_step(problem: &AngleProblem, angles: &[[f64; 3]], multipliers: &[f64]) -> Vec<[f64; 3]> {
+fn angle_step(
+    problem: &AngleProblem,
+    angles: &[[f64; 3]],
+    cotangents: &[[f64; 3]],
+    multipliers: &[f64],
+) -> Vec<[f64; 3]> {
     let each = |t: usize| {
         let inverse = problem.weight[t].map(|w| 1.0 / w);
         let mut step = free_step(&angles[t], &problem.target[t], &inverse);
@@ -197,7 +251,7 @@ fn angle_step(problem: &AngleProblem, angles: &[[f64; 3]], multipliers: &[f64]) 
         for k in 0..3 {
             let v = problem.inner[problem.faces[t][k] as usize];
             if v != FREE {
-                let gradients = AngleProblem::gradients(&angles[t], k);
+                let gradients = AngleProblem::gradients(&cotangents[t], k);
                 for (row, gradient) in gradients.iter().enumerate() {
                     let multiplier = multipliers[2 * v as usize + row];
                     (0..3).for_each(|i| push[i] += multiplier * gradient[i]);
@@ -208,7 +262,7 @@ fn angle_step(problem: &AngleProblem, angles: &[[f64; 3]], multipliers: &[f64]) 
         (0..3).for_each(|i| step[i] -= push[i]);
         step
     };
-    (0..problem.faces.len()).map(each).collect()
+    (0..problem.faces.len()).into_par_iter().with_min_len(1024).map(each).collect()
 }
 
 #[cfg(test)]

@@ -16,6 +16,7 @@ use crate::cut::Strip;
 use crate::mesh::Mesh;
 use crate::mesh::topology::{NO_TWIN, twins};
 use crate::numeric::{Vec2, sparse};
+use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
 /// Marks a vertex without conditions: on the boundary, or without faces.
@@ -102,8 +103,8 @@ impl<'a> AngleProblem<'a> {
     pub fn residuals(&self, angles: &[[f64; 3]]) -> Vec<f64> {
         let mut residual = vec![0.0; 2 * self.inner_count];
         residual.iter_mut().step_by(2).for_each(|r| *r = -TAU);
-        for (corners, a) in self.faces.iter().zip(angles) {
-            let log = a.map(|x| x.sin().ln());
+        let logs: Vec<[f64; 3]> = angles.par_iter().map(|a| a.map(|x| x.sin().ln())).collect();
+        for ((corners, a), log) in self.faces.iter().zip(angles).zip(&logs) {
             for k in 0..3 {
                 let v = self.inner[corners[k] as usize];
                 if v != FREE {
@@ -146,15 +147,15 @@ impl<'a> AngleProblem<'a> {
         longest
     }
 
-    /// The derivative of the two conditions of the inner vertex at corner `k` with respect to the face's three angles.
-    pub fn gradients(angles: &[f64; 3], k: usize) -> [[f64; 3]; 2] {
+    /// The derivative of the two conditions of the inner vertex at corner `k` with respect to the face's three angles,
+    /// given their cotangents.
+    pub fn gradients(cotangents: &[f64; 3], k: usize) -> [[f64; 3]; 2] {
         let (after, before) = ((k + 1) % 3, (k + 2) % 3);
-        let cot = |a: f64| a.cos() / a.sin();
         let mut plane = [0.0; 3];
         let mut length = [0.0; 3];
         plane[k] = 1.0;
-        length[after] = cot(angles[after]);
-        length[before] = -cot(angles[before]);
+        length[after] = cotangents[after];
+        length[before] = -cotangents[before];
         [plane, length]
     }
 }

@@ -10,10 +10,12 @@
 
 use crate::cut::Strip;
 use crate::numeric::Vec2;
-use crate::numeric::sparse::{Cholesky, Error, Pattern};
+use crate::numeric::sparse::{Analysis, Cholesky, Error, Pattern};
 
 /// `M` with its mesh.
 pub(super) struct ConformalForm {
+    /// Vertices coupled along edges; orders the elimination.
+    edges: Pattern,
     pattern: Pattern,
     values: Vec<f64>,
     /// Whether a vertex is on the boundary.
@@ -102,7 +104,7 @@ impl ConformalForm {
             pattern.end_column();
         }
         let (pattern, values) = pattern.finish();
-        Ok(Self { pattern, values, boundary })
+        Ok(Self { edges, pattern, values, boundary })
     }
 
     /// Which vertices are on a boundary loop.
@@ -115,7 +117,7 @@ impl ConformalForm {
         let mut right = vec![0.0; self.pattern.unknowns()];
         let at = |j: usize| pins.iter().find(|p| p.0 as usize == j / 2).map(|p| p.1[j % 2]);
         self.pattern.fix_unknowns(&mut self.values, &mut right, at);
-        let x = Cholesky::of(&self.pattern, &self.values)?.solve_refined(&self.pattern, &self.values, &right);
+        let x = self.factor()?.solve_refined(&self.pattern, &self.values, &right);
         let residual = self.pattern.relative_residual(&self.values, &x, &right);
         Ok((pair_up(&x), residual))
     }
@@ -125,8 +127,12 @@ impl ConformalForm {
     pub fn factor_shifted(mut self, sigma: f64) -> Result<ShiftedForm, Error> {
         let boundary = &self.boundary;
         self.pattern.add_to_diagonal(&mut self.values, |j| if boundary[j / 2] { sigma } else { 0.0 });
-        let factor = Cholesky::of(&self.pattern, &self.values)?;
-        Ok(ShiftedForm { form: self, factor })
+        let factor = self.factor()?;
+        Ok(ShiftedForm { form: self, factor, sigma })
+    }
+
+    fn factor(&self) -> Result<Cholesky, Error> {
+        Cholesky::new(&self.pattern, &Analysis::of_paired(&self.edges, &self.pattern)?, &self.values)
     }
 
     /// Mean diagonal entry of `M`: the scale that a shift is measured against.
@@ -140,12 +146,21 @@ impl ConformalForm {
 pub(super) struct ShiftedForm {
     form: ConformalForm,
     factor: Cholesky,
+    sigma: f64,
 }
 
 impl ShiftedForm {
     /// The form, shifted.
     pub fn form(&self) -> &ConformalForm {
         &self.form
+    }
+
+    /// Adds to a load what the shift takes away from a solution that lies at `uv`: without it, the shift pulls the far ends
+    /// of a long strip towards the origin.
+    pub fn make_up_for_shift(&self, load: &mut [Vec2], uv: &[Vec2]) {
+        for ((l, p), _) in load.iter_mut().zip(uv).zip(&self.form.boundary).filter(|(_, on)| **on) {
+            *l += p * self.sigma;
+        }
     }
 
     /// Solves for a load of one vector a vertex. Returns the chart and the relative residual.

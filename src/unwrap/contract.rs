@@ -1,7 +1,7 @@
 //! The contract that every unwrap method owes, checked for every method in the list by itself. Tests only.
 
 use super::closed_form::{self, Known};
-use super::{Chart, Method, Settings, Summary, flatten};
+use super::{Chart, ChartIndex, Method, Settings, Summary, flatten};
 use crate::axis::Axis;
 use crate::cut::Strip;
 use crate::mesh::Mesh;
@@ -128,6 +128,34 @@ fn one_thread_and_two_give_the_same_bytes() {
         let bits =
             |chart: Chart| -> Vec<[u64; 2]> { chart.uv().iter().map(|p| [p.x.to_bits(), p.y.to_bits()]).collect() };
         assert!(bits(on(1)) == bits(on(2)), "{method}");
+    }
+}
+
+#[test]
+fn every_place_on_the_map_goes_back_to_its_point() {
+    let known = rough();
+    for method in Method::NAMES {
+        let (chart, summary) = chart(method, known.strip.clone(), &known.axis);
+        if summary.flipped_faces + summary.overlaps > 0 {
+            // Where the map covers itself a place has two points.
+            assert!(
+                method.starts_with("deform-"),
+                "{method}: {} flips, {} overlaps",
+                summary.flipped_faces,
+                summary.overlaps
+            );
+            continue;
+        }
+        let index = ChartIndex::of(&chart);
+        let mesh = chart.strip().mesh();
+        for face in 0..mesh.faces().len() as u32 {
+            let at = [0.2, 0.5, 0.3];
+            let place: Vec2 = chart.corners_in_chart(face).iter().zip(at).map(|(p, w)| p * w).sum();
+            let point: Vec3 = mesh.corners(face).iter().zip(at).map(|(p, w)| p * w).sum();
+            let back = index.surface_point(place).unwrap_or_else(|| panic!("{method}: face {face} is off the map"));
+            let back: Vec3 = mesh.corners(back.face).iter().zip(back.barycentric).map(|(p, w)| p * w).sum();
+            assert!((back - point).norm() < 1e-9, "{method}: {:e} m", (back - point).norm());
+        }
     }
 }
 

@@ -14,6 +14,8 @@
 //! | s1 / s2 | `anisotropy` | angle error | 1 |
 //! | sqrt((s1^-2 + s2^-2) / 2) | `sander_l2` | root mean square length factor from map to surface | 1 |
 //! | (s1^2 + s2^2 + s1^-2 + s2^-2) / 4 | `symmetric_dirichlet` | isometric energy | 1 |
+//! | sum A (s1 - s2)^2 / 2 | `conformal_energy_m2` | energy of LSCM (Lévy et al. 2002) | 0 |
+//! | sum A ((s1 - 1)^2 + (s2 - 1)^2) | `rigid_energy_m2` | energy of ARAP (Liu et al. 2008) | 0 |
 //!
 //! Averages and percentiles are weighted by surface area. Faces without area on the surface have no Jacobian; they are
 //! counted and left out. Flips and overlaps are decided with exact predicates, never with a tolerance.
@@ -21,10 +23,11 @@
 //! References: P. Sander, J. Snyder, S. Gortler, H. Hoppe, "Texture mapping progressive meshes", SIGGRAPH 2001,
 //! doi:10.1145/383259.383307 (stretch, L2); J. Shewchuk, "Adaptive precision floating-point arithmetic and fast robust
 //! geometric predicates", Discrete & Computational Geometry 18, 1997, doi:10.1007/PL00009321 (orientation).
-//! Cost: linear; percentiles sort once each.
+//! Cost: linear.
 
 use crate::cut::Strip;
-use crate::mesh::{FaceId, Mesh};
+use crate::mesh::{FaceId, Mesh, topology};
+use crate::numeric::statistics::weighted_quantiles;
 use crate::numeric::{Mat2, Vec2, Vec3, svd2x2};
 use rayon::prelude::*;
 use robust::{Coord, orient2d};
@@ -126,20 +129,10 @@ pub struct Distribution {
 impl Distribution {
     /// The distribution of `values` weighted by `areas`; all zero when there are none.
     pub fn of(values: &[f64], areas: &[f64]) -> Self {
-        let mut order: Vec<(f64, f64)> = values.iter().copied().zip(areas.iter().copied()).collect();
-        // Equal values are ordered by area, so that the sums below are the same on any number of threads.
-        order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        let Some(at) = weighted_quantiles(values, areas, &[0.05, 0.5, 0.95, 0.99]) else { return Self::default() };
+        let (first, last) =
+            values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
         let total: f64 = areas.iter().sum();
-        let (Some(&(first, _)), Some(&(last, _))) = (order.first(), order.last()) else { return Self::default() };
-        let mut at = [last; 4];
-        let (mut below, mut next) = (0.0, 0);
-        for &(value, area) in &order {
-            below += area;
-            while next < 4 && below >= [0.05, 0.5, 0.95, 0.99][next] * total {
-                at[next] = value;
-                next += 1;
-            }
-        }
         let mean = values.iter().zip(areas).map(|(v, w)| v * w).sum::<f64>() / total;
         Self { min: first, p05: at[0], mean, p50: at[1], p95: at[2], p99: at[3], max: last }
     }
@@ -162,6 +155,11 @@ pub struct Distortion {
     pub symmetric_dirichlet: f64,
     /// Sander's L2 stretch: root of the area-weighted mean of (s1^-2 + s2^-2) / 2.
     pub sander_l2: f64,
+    /// Conformal energy of the map as it lies: sum of area (s1 - s2)^2 / 2, square metres; what `lscm` makes small.
+    pub conformal_energy_m2: f64,
+    /// Rigid energy of the map as it lies: sum of area ((s1 - 1)^2 + (s2 - 1)^2), which is area |J - R|^2 with the
+    /// closest rotation R, square metres; what `arap` makes small.
+    pub rigid_energy_m2: f64,
     /// Area of the surface, square metres.
     pub surface_area_m2: f64,
     /// Area of the map, square metres; flipped faces count negative.
@@ -187,17 +185,29 @@ impl Distortion {
         let mean = |value: fn(&FaceDistortion) -> f64| {
             if total > 0.0 { defined.iter().map(|f| value(f) * f.area).sum::<f64>() / total } else { 0.0 }
         };
+        let figures: [fn(&FaceDistortion) -> f64; 5] = [
+            FaceDistortion::stretch,
+            |f| f.s1 * f.s2,
+            |f| f.s1.max(SMALLEST_FACTOR) / f.small(),
+            |f| f.s1,
+            |f| f.s2.abs(),
+        ];
+        let mut spreads = [Distribution::default(); 5];
+        spreads.par_iter_mut().zip(figures).for_each(|(slot, figure)| *slot = spread(figure));
+        let [stretch, area_ratio, anisotropy, s1, s2] = spreads;
         Self {
-            stretch: spread(FaceDistortion::stretch),
-            area_ratio: spread(|f| f.s1 * f.s2),
-            anisotropy: spread(|f| f.s1.max(SMALLEST_FACTOR) / f.small()),
-            s1: spread(|f| f.s1),
-            s2: spread(|f| f.s2.abs()),
+            stretch,
+            area_ratio,
+            anisotropy,
+            s1,
+            s2,
             symmetric_dirichlet: mean(|f| {
                 let (a, b) = (f.s1.max(SMALLEST_FACTOR).powi(2), f.small().powi(2));
                 (a + b + 1.0 / a + 1.0 / b) / 4.0
             }),
             sander_l2: mean(|f| (f.s1.max(SMALLEST_FACTOR).powi(-2) + f.small().powi(-2)) / 2.0).sqrt(),
+            conformal_energy_m2: defined.iter().map(|f| f.area * (f.s1 - f.s2).powi(2) / 2.0).sum(),
+            rigid_energy_m2: defined.iter().map(|f| f.area * ((f.s1 - 1.0).powi(2) + (f.s2 - 1.0).powi(2))).sum(),
             surface_area_m2: total,
             map_area_m2: defined.iter().map(|f| f.s1 * f.s2 * f.area).sum(),
             degenerate_faces: faces.len() - defined.len(),
@@ -289,26 +299,25 @@ fn segments_cross([a, b]: [Vec2; 2], [c, d]: [Vec2; 2]) -> bool {
 pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
     let faces = mesh.faces();
     let count = mesh.vertices().len();
-    let mut edges: Vec<(u32, u32)> = Vec::with_capacity(faces.len() * 3);
-    for corners in faces {
-        for i in 0..3 {
-            let (a, b) = (corners[i], corners[(i + 1) % 3]);
-            edges.push((a.min(b), a.max(b)));
-        }
-    }
-    edges.par_sort_unstable();
+    let twin = topology::twins(faces).expect("a Mesh is manifold");
     let mut border = vec![false; count];
-    let mut unique: Vec<(u32, u32, bool)> = Vec::with_capacity(edges.len() / 2 + 1);
+    let mut unique: Vec<(u32, u32, bool)> = Vec::with_capacity(twin.len() / 2 + 1);
     let mut squared = 0.0;
-    for group in edges.chunk_by(|x, y| x == y) {
-        let (a, b) = group[0];
-        unique.push((a, b, group.len() == 1));
+    for (half_edge, &other) in twin.iter().enumerate() {
+        let on_border = other == topology::NO_TWIN;
+        if !on_border && (other as usize) < half_edge {
+            continue;
+        }
+        let corners = faces[half_edge / 3];
+        let (a, b) = (corners[half_edge % 3], corners[(half_edge + 1) % 3]);
+        unique.push((a, b, on_border));
         squared += (mesh.vertices()[a as usize] - mesh.vertices()[b as usize]).norm_squared();
-        if group.len() == 1 {
+        if on_border {
             border[a as usize] = true;
             border[b as usize] = true;
         }
     }
+    drop(twin);
     if unique.is_empty() {
         return mesh.clone();
     }
@@ -386,6 +395,8 @@ mod tests {
         assert!((d.stretch.mean - 3.0).abs() < 1e-14 && (d.area_ratio.mean - 1.5).abs() < 1e-14);
         assert!((d.anisotropy.max - 6.0).abs() < 1e-13);
         assert!((d.symmetric_dirichlet - (9.0 + 0.25 + 1.0 / 9.0 + 4.0) / 4.0).abs() < 1e-14);
+        assert!((d.conformal_energy_m2 - 0.5 * 2.5 * 2.5 / 2.0).abs() < 1e-14);
+        assert!((d.rigid_energy_m2 - 0.5 * (4.0 + 0.25)).abs() < 1e-14);
         assert!((d.sander_l2 - ((1.0 / 9.0 + 4.0) / 2.0_f64).sqrt()).abs() < 1e-14);
     }
 

@@ -2,7 +2,7 @@
 //! tunnel, and the section chart that the methods start from, are placed on and are judged by.
 
 use super::handles::Handle;
-use super::{Error, section, unfold};
+use super::{Error, distortion, section, unfold};
 use crate::axis::{Axis, AxisCoordinates};
 use crate::cut::Strip;
 use crate::mesh::topology;
@@ -11,6 +11,13 @@ use crate::warning::Warning;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::f64::consts::TAU;
+
+/// Share of the faces that may stay folded in the section chart of an axis that is believed without being asked for.
+const MOST_FOLDED: f64 = 0.02;
+/// Mean stretch that the section chart of such an axis may have: rough rock has 1.05, sharp bends 1.2.
+const MOST_STRETCH: f64 = 1.6;
+/// One collapsed face counts no more than this.
+const UNBELIEVABLE_STRETCH: f64 = 20.0;
 
 /// A strip as the axis sees it.
 #[derive(Clone, Debug)]
@@ -94,6 +101,28 @@ impl Guide {
     /// Handles given by a person, for the methods that can be steered.
     pub fn handles(&self) -> &[Handle] {
         &self.handles
+    }
+
+    /// Why the axis is not that of the strip, if it is not: a surface that does not run around it gives a section chart
+    /// that is wildly stretched or folded.
+    pub fn doubt(&self, strip: &Strip) -> Option<String> {
+        let faces = strip.mesh().faces().len();
+        let folded = self.summary.flipped_faces;
+        if folded as f64 > MOST_FOLDED * faces as f64 {
+            return Some(format!("{folded} of {faces} faces stay folded in its section chart"));
+        }
+        if self.summary.ambiguous_edges as f64 > MOST_FOLDED * faces as f64 {
+            return Some(format!("{} edges pass around it", self.summary.ambiguous_edges));
+        }
+        let (mut sum, mut total) = (0.0, 0.0);
+        for face in distortion::of_faces(strip.mesh(), &self.uv) {
+            if face.is_defined() {
+                sum += face.area * face.stretch().min(UNBELIEVABLE_STRETCH);
+                total += face.area;
+            }
+        }
+        let mean = if total > 0.0 { sum / total } else { 1.0 };
+        (mean > MOST_STRETCH).then(|| format!("its section chart stretches {mean:.1} times in the mean"))
     }
 
     /// The axis.

@@ -32,10 +32,11 @@
 //! rounding. Very obtuse triangles can flip in the solve; they are unfolded afterwards (`unfold`) and counted. The result
 //! is scaled to the area of the surface.
 //! Departures: `M` is assembled as Laplacian minus area, which is the same energy as Lévy's rows without forming
-//! `A^T A`; the shift (1e-10 of the mean diagonal of `M`, boundary vertices only) makes it definite.
+//! `A^T A`; the shift (1e-10 of the mean diagonal of `M`, boundary vertices only) makes it definite, and the load of the
+//! even form makes up for it.
 //! Cost: one Cholesky factorization of twice the number of vertices, then one solve a round.
 
-use super::conformal::{ConformalForm, ShiftedForm, far_pair};
+use super::conformal::{ConformalForm, ShiftedForm, far_pair, used_vertices};
 use super::finish::finish;
 use super::guide::Guide;
 use super::rigid_fit::{chart_area, closest_rotations, conformal_energy, rotation_load};
@@ -65,6 +66,9 @@ pub struct Settings {
     /// Rounds of the even form (default 2 with an axis, 10 without) and at most of the spectral form (default 50).
     /// The pinned form has none.
     pub rounds: Option<usize>,
+    /// The two vertices that the pinned form holds, as numbered in the mesh. Two boundary vertices far from each other
+    /// when not given.
+    pub pins: Option<[u32; 2]>,
 }
 
 /// What keeps the map from shrinking to a point.
@@ -82,7 +86,7 @@ pub enum Form {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { form: Form::Even, tie: 0.01, rounds: None }
+        Self { form: Form::Even, tie: 0.01, rounds: None, pins: None }
     }
 }
 
@@ -104,10 +108,13 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     let tied_form = |tie: f64| {
         ConformalForm::new(strip, |f| shapes.shapes[f].cotangents().map(|c| c * (1.0 + tie))).map_err(solve_error)
     };
-    let pinned = || tied_form(0.0)?.solve_pinned(pins(strip)).map_err(solve_error);
+    let pins = pins(strip, settings)?;
+    let pinned = || tied_form(0.0)?.solve_pinned(pins).map_err(solve_error);
     let mut uv = match settings.form {
         Form::Pinned => {
             let (uv, residual) = pinned()?;
+            summary.figures.insert("first_pin".to_owned(), pins[0].0.into());
+            summary.figures.insert("second_pin".to_owned(), pins[1].0.into());
             summary.residual = Some(residual);
             uv
         }
@@ -115,7 +122,7 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
             let start = guide.map_or_else(|| pinned().map(|(uv, _)| uv), |g| Ok(g.uv().to_vec()))?;
             let shifted = shift(tied_form(settings.tie)?, &mut summary)?;
             let rounds = settings.rounds.unwrap_or(if guide.is_some() { 2 } else { 10 });
-            even_rounds(strip, &shapes, &shifted, start, rounds, &mut summary)
+            even_rounds(strip, &shapes, (&shifted, settings.tie), start, rounds, &mut summary)
         }
         Form::Spectral => spectral_rounds(strip, &shift(tied_form(0.0)?, &mut summary)?, settings, &mut summary),
     };
@@ -133,12 +140,32 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     Ok((uv, summary))
 }
 
-/// The two pins: far apart on the boundary, on the u axis, as far apart as in space.
-fn pins(strip: &Strip) -> [(u32, Vec2); 2] {
-    let [a, b] = far_pair(strip);
+/// The two pins: given, or far apart on the boundary; on the u axis, as far apart as in space.
+///
+/// # Errors
+/// [`Error::Setting`] for pins that are no two places of the mesh.
+fn pins(strip: &Strip, settings: &Settings) -> Result<[(u32, Vec2); 2], Error> {
     let vertices = strip.mesh().vertices();
+    let [a, b] = match settings.pins {
+        None => far_pair(strip),
+        Some(pins) if settings.form != Form::Pinned => {
+            let must = "left out unless form = \"pinned\": the other forms hold no vertex";
+            return Err(Error::Setting { key: "lscm.pins", value: pins[0].into(), must });
+        }
+        Some(pins) => {
+            let used = used_vertices(vertices.len(), strip.mesh().faces());
+            let bad = |v: &u32| !used.get(*v as usize).copied().unwrap_or(false);
+            if let Some(&pin) = pins.iter().find(|v| bad(v)) {
+                return Err(Error::Setting { key: "lscm.pins", value: pin.into(), must: "a vertex that has faces" });
+            }
+            pins
+        }
+    };
     let d = (vertices[a as usize] - vertices[b as usize]).norm();
-    [(a, Vec2::zeros()), (b, Vec2::new(d, 0.0))]
+    if !(d > 0.0) {
+        return Err(Error::Setting { key: "lscm.pins", value: b.into(), must: "at another place than the first pin" });
+    }
+    Ok([(a, Vec2::zeros()), (b, Vec2::new(d, 0.0))])
 }
 
 /// Adds the shift, records it, and factors.
@@ -161,7 +188,7 @@ fn pulled_apart(strip: &Strip, shifted: &ShiftedForm) -> Vec<Vec2> {
 fn even_rounds(
     strip: &Strip,
     shapes: &Shapes,
-    shifted: &ShiftedForm,
+    (shifted, tie): (&ShiftedForm, f64),
     start: Vec<Vec2>,
     rounds: usize,
     summary: &mut SolveSummary,
@@ -169,7 +196,10 @@ fn even_rounds(
     let (n, faces) = (strip.mesh().vertices().len(), strip.mesh().faces());
     let mut uv = start;
     for _ in 0..rounds {
-        let load = rotation_load(n, faces, &shapes.shapes, &closest_rotations(faces, &shapes.shapes, &uv));
+        let mut load = rotation_load(n, faces, &shapes.shapes, &closest_rotations(faces, &shapes.shapes, &uv));
+        // The rotations come with the weight of the tie, so that the map has its own size in every round.
+        load.iter_mut().for_each(|l| *l *= tie);
+        shifted.make_up_for_shift(&mut load, &uv);
         let (next, residual) = shifted.solve(&load);
         uv = next;
         summary.residual = Some(residual);
@@ -296,6 +326,20 @@ mod tests {
             let (uv, summary) = flatten(&strip, None, &settings(form)).unwrap();
             assert!(worst_edge(&strip, &uv) < 1e-6, "{form:?}");
             assert!(summary.figures["unused_vertices"] > 0.0);
+        }
+    }
+
+    #[test]
+    fn a_strip_four_hundred_times_as_long_as_wide_keeps_every_length() {
+        let mesh = closed_form::grid(600, 8, 0.0, |along, around| {
+            let angle = std::f64::consts::PI * (around - 0.5);
+            Vec3::new(1200.0 * along, -angle.sin(), angle.cos())
+        });
+        let strip = Strip::from_disk(mesh).unwrap();
+        for form in FORMS {
+            let (uv, summary) = flatten(&strip, None, &settings(form)).unwrap();
+            assert!(worst_edge(&strip, &uv) < 1e-4, "{form:?}: {}", worst_edge(&strip, &uv));
+            assert_eq!(summary.figures["unfolded_faces"], 0.0);
         }
     }
 

@@ -24,8 +24,19 @@ pub enum Freedom {
     Similar,
 }
 
+/// What a method makes of the tunnel axis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AxisUse {
+    /// It places its result by the axis or opens the tunnel along it: no axis, no map.
+    Needs,
+    /// It starts nearer to its result with an axis; without one it starts from a conformal map.
+    Profits,
+    /// Only the place of the result on the page depends on it.
+    Ignores,
+}
+
 macro_rules! methods {
-    ($( $(#[$doc:meta])* $variant:ident($module:ident) = $name:literal, $freedom:ident; )+) => {
+    ($( $(#[$doc:meta])* $variant:ident($module:ident) = $name:literal, $freedom:ident, $axis:ident; )+) => {
         /// A method of flattening with its settings. Written as a table named after the method, or just its name.
         #[derive(Clone, Debug, PartialEq)]
         #[non_exhaustive]
@@ -55,9 +66,9 @@ macro_rules! methods {
                 match self { $(Self::$variant(_) => Freedom::$freedom,)+ }
             }
 
-            /// Whether the method cannot do without the tunnel axis: it places its result itself.
-            pub fn needs_axis(&self) -> bool {
-                self.freedom() == Freedom::Placed
+            /// What it makes of the tunnel axis.
+            pub fn axis_use(&self) -> AxisUse {
+                match self { $(Self::$variant(_) => AxisUse::$axis,)+ }
             }
 
             /// Map coordinates of each vertex, not yet registered.
@@ -166,21 +177,21 @@ impl JsonSchema for Method {
 
 methods! {
     /// Chainage and true girth of the section; no optimisation.
-    Section(section) = "section", Placed;
+    Section(section) = "section", Placed, Needs;
     /// Least squares conformal map: keeps angles.
-    Lscm(lscm) = "lscm", Similar;
+    Lscm(lscm) = "lscm", Similar, Profits;
     /// Relaxed section chart: nearly isometric, yet a chainage ruler. The default.
-    Relax(relax) = "relax", Placed;
+    Relax(relax) = "relax", Placed, Needs;
     /// Angle based flattening by full Newton steps: the reference for small meshes.
-    Abf(abf) = "abf", Similar;
+    Abf(abf) = "abf", Similar, Ignores;
     /// Angle based flattening by reduced Newton steps: least angle distortion.
-    AbfPlusPlus(abf_plus_plus) = "abf++", Similar;
+    AbfPlusPlus(abf_plus_plus) = "abf++", Similar, Ignores;
     /// As-rigid-as-possible map: lengths, areas and angles all nearly right.
-    Arap(arap) = "arap", Rigid;
+    Arap(arap) = "arap", Rigid, Profits;
     /// Scalable locally injective map: never a flip, mild worst triangles.
-    Slim(slim) = "slim", Rigid;
+    Slim(slim) = "slim", Rigid, Profits;
     /// As-rigid-as-possible deformation in space, then projection.
-    DeformArap(deform_arap) = "deform-arap", Placed;
+    DeformArap(deform_arap) = "deform-arap", Placed, Needs;
     /// Bones that open the tunnel like a book, then projection.
-    DeformSkin(deform_skin) = "deform-skin", Placed;
+    DeformSkin(deform_skin) = "deform-skin", Placed, Needs;
 }

@@ -9,18 +9,21 @@ mod angles;
 pub mod arap;
 mod cage;
 mod conformal;
+mod corner_sums;
 pub mod chart_index;
 pub mod deform_arap;
 pub mod deform_skin;
 pub mod distortion;
 mod fans;
 mod finish;
+mod flip_free_step;
 pub mod guide;
 pub mod handles;
 pub mod lscm;
 pub mod method;
 mod opening;
 mod poisson;
+mod quasi_newton;
 pub mod readability;
 pub mod registration;
 pub mod relax;
@@ -28,18 +31,23 @@ mod rigid_fit;
 pub mod section;
 pub mod slim;
 mod start;
+mod stopping;
 mod triangle_shapes;
 pub mod unfold;
 #[cfg(test)]
 pub(crate) mod closed_form;
 #[cfg(test)]
 mod contract;
+#[cfg(test)]
+mod independent;
+#[cfg(test)]
+mod robustness;
 
 pub use chart_index::{ChartIndex, RoundTrip, covered_points, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
 pub use handles::Handle;
-pub use method::{Freedom, Method};
+pub use method::{AxisUse, Freedom, Method};
 pub use readability::Readability;
 
 use crate::axis::Axis;
@@ -187,6 +195,14 @@ impl Settings {
     /// A method with the default way of telling its distortion.
     pub fn of(method: Method) -> Self {
         Self { method, smoothing_m: None }
+    }
+
+    /// How the section chart that guides the method is made.
+    pub fn section(&self) -> section::Settings {
+        match &self.method {
+            Method::Section(own) => own.clone(),
+            _ => section::Settings::default(),
+        }
     }
 }
 
@@ -341,18 +357,23 @@ pub fn flatten_with_handles(
     handles: &[Handle],
     settings: &Settings,
 ) -> Result<(Chart, Summary), Error> {
-    if let (Some(path), true) = (settings.method.handles_file(), handles.is_empty()) {
+    let guide = axis.map(|axis| Guide::of_strip(&strip, axis, &settings.section())).transpose()?;
+    flatten_guided(strip, guide.map(|guide| guide.with_handles(handles)), settings)
+}
+
+/// [`flatten_with_handles`] with a guide that is already made and has its handles.
+///
+/// # Errors
+/// As [`flatten_with_handles`].
+pub fn flatten_guided(strip: Strip, guide: Option<Guide>, settings: &Settings) -> Result<(Chart, Summary), Error> {
+    if let (Some(path), true) =
+        (settings.method.handles_file(), guide.as_ref().is_some_and(|guide| guide.handles().is_empty()))
+    {
         return Err(Error::HandlesNotRead { path: path.clone() });
     }
     if let Some(value) = settings.smoothing_m.filter(|s| !(*s >= 0.0 && s.is_finite())) {
         return Err(Error::Setting { key: "smoothing_m", value, must: "0 or more metres" });
     }
-    let section_settings = match &settings.method {
-        Method::Section(own) => own.clone(),
-        _ => section::Settings::default(),
-    };
-    let guide = axis.map(|axis| Guide::of_strip(&strip, axis, &section_settings)).transpose()?;
-    let guide = guide.map(|guide| guide.with_handles(handles));
     let (mut uv, solve) = settings.method.solve(&strip, guide.as_ref())?;
     let placement = registration::place(&strip, guide.as_ref(), settings.method.freedom(), &mut uv)?;
     let chart = Chart::new(strip, uv)?;
@@ -367,17 +388,23 @@ pub fn flatten_with_handles(
         let girth = guide.as_ref().map_or_else(|| mesh.area().sqrt(), |g| g.summary().section.mean_girth_m);
         SMOOTHING_M.min(girth * SMOOTHING_OF_GIRTH)
     });
-    let smoothed =
-        (smoothing_m > 0.0).then(|| Distortion::of(&distortion::smoothed_surface(mesh, smoothing_m), chart.uv()));
+    let uv = chart.uv();
+    let ((distortion, overlaps), (smoothed, readability)) = rayon::join(
+        || (Distortion::of(mesh, uv), distortion::border_crossings(chart.strip(), uv)),
+        || {
+            let smooth = || Distortion::of(&distortion::smoothed_surface(mesh, smoothing_m), uv);
+            ((smoothing_m > 0.0).then(smooth), guide.as_ref().map(|guide| Readability::of(mesh, uv, guide)))
+        },
+    );
     let summary = Summary {
         method: settings.method.name().to_owned(),
         flipped_faces,
         collapsed_faces,
-        overlaps: distortion::border_crossings(chart.strip(), chart.uv()),
-        distortion: Distortion::of(mesh, chart.uv()),
+        overlaps,
+        distortion,
         smoothed,
         smoothing_m,
-        readability: guide.as_ref().map(|guide| Readability::of(mesh, chart.uv(), guide)),
+        readability,
         registration: placement,
         guide: guide.map(|g| g.summary().clone()),
         solve,

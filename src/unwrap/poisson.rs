@@ -1,5 +1,5 @@
-//! The global half of local/global methods: the map whose gradient fits a load best, with the cotangent Laplacian factored
-//! once for all iterations.
+//! The global half of local/global methods: a Poisson equation with the cotangent Laplacian, factored once for all
+//! iterations.
 
 use super::conformal::{cotangent_laplacian, used_vertices};
 use super::triangle_shapes::Shapes;
@@ -26,26 +26,17 @@ impl Poisson {
         Ok(Self { factor: Cholesky::of(&pattern, &values)?, used, held })
     }
 
-    /// Solves `L x = load` for u and v. The load must sum to zero; the mean becomes that of `reference`.
-    pub fn solve(&self, load: &[Vec2], reference: &[Vec2]) -> Vec<Vec2> {
-        let n = load.len();
-        let mut x: Vec<f64> = load.iter().map(|p| p.x).chain(load.iter().map(|p| p.y)).collect();
+    /// The inverse of the rigid energy's Hessian with held rotations, `2 L`, applied to a gradient, which must sum to zero.
+    /// The mean of the result is zero.
+    pub fn correction(&self, gradient: &[Vec2]) -> Vec<Vec2> {
+        let n = gradient.len();
+        let mut x: Vec<f64> = gradient.iter().map(|g| g.x / 2.0).chain(gradient.iter().map(|g| g.y / 2.0)).collect();
         (x[self.held], x[n + self.held]) = (0.0, 0.0);
-        for v in (0..n).filter(|&v| !self.used[v]) {
-            (x[v], x[n + v]) = (0.0, 0.0);
-        }
         self.factor.solve_in_place(&mut x);
-        let mut uv: Vec<Vec2> = (0..n).map(|v| Vec2::new(x[v], x[n + v])).collect();
-        let shift = self.mean(reference) - self.mean(&uv);
-        uv.iter_mut().for_each(|p| *p += shift);
-        uv
-    }
-
-    /// Mean over the vertices that have faces.
-    fn mean(&self, uv: &[Vec2]) -> Vec2 {
-        let mut used = uv.iter().zip(&self.used).filter(|(_, u)| **u).map(|(p, _)| *p);
-        let first = used.next().unwrap_or_else(Vec2::zeros);
-        let (sum, count) = used.fold((Vec2::zeros(), 1.0), |(s, n), p| (s + (p - first), n + 1.0));
-        first + sum / count
+        let mut step: Vec<Vec2> = (0..n).map(|v| Vec2::new(x[v], x[n + v])).collect();
+        let used = || self.used.iter().enumerate().filter(|(_, used)| **used).map(|(v, _)| v);
+        let mean = used().fold(Vec2::zeros(), |sum, v| sum + step[v]) / used().count().max(1) as f64;
+        used().for_each(|v| step[v] -= mean);
+        step
     }
 }

@@ -34,7 +34,11 @@
 //! unfolded) are pulled towards rigidity without the barrier and counted.
 //! Cost: two factorizations (about 1 s a million faces together) and 0.2 s a step and million faces.
 
+use super::corner_sums::CornerSums;
+use super::flip_free_step::largest_flip_free_step;
 use super::guide::Guide;
+use super::quasi_newton::{Memory, advance, chunked_sum, dot};
+use super::rigid_fit::{rigid_density, rigid_slope};
 use super::triangle_shapes::{Shape, Shapes};
 use super::{Error, SolveSummary, distortion};
 use crate::cut::Strip;
@@ -44,7 +48,6 @@ use crate::numeric::{Mat2, Vec2};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
 
 /// Settings of `relax`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -74,15 +77,10 @@ const PLACE_TIE: f64 = 1e-7;
 const STRAIGHTEST: f64 = 0.95;
 /// Steps that minimise the rigid energy first: it has no barrier, so needles in the start do not slow it down.
 const RIGID_STEPS: usize = 3;
-/// Steps that L-BFGS remembers.
-const MEMORY: usize = 6;
 /// Share of the way to the first flip that a step may go.
 const SAFETY: f64 = 0.8;
 /// Armijo's constant: share of the promised descent that a step must keep.
 const ARMIJO: f64 = 1e-4;
-/// Faces or vertices handled in one go; fixed, so that sums add up in the same order on any number of threads.
-const CHUNK: usize = 8192;
-
 /// Relaxes the section chart; see the module.
 ///
 /// # Errors
@@ -118,16 +116,16 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
         }
     }
 
-    let mut history: VecDeque<Pair> = VecDeque::new();
+    let mut memory = Memory::default();
     let mut energy = problem.energy(&uv);
     let mut gradient = problem.gradient(&uv);
     let mut calm = 0;
     while summary.iterations < settings.max_iterations.max(1) {
-        let mut direction = quasi_newton_direction(&gradient, &history, &step);
+        let mut direction = memory.direction(&gradient, |g| step.apply(g, 1.0));
         let mut slope = dot(&gradient, &direction);
         if slope >= 0.0 {
             // The memory is misleading; the preconditioned gradient always descends.
-            history.clear();
+            memory.forget();
             direction = step.apply(&gradient, -1.0);
             slope = dot(&gradient, &direction);
         }
@@ -148,13 +146,7 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
             break;
         }
         let next_gradient = problem.gradient(&moved);
-        let pair = Pair::new(&uv, &moved, &gradient, &next_gradient);
-        if pair.curvature > 0.0 {
-            if history.len() == MEMORY {
-                history.pop_front();
-            }
-            history.push_back(pair);
-        }
+        memory.remember([&uv, &moved], [&gradient, &next_gradient]);
         let gain = (energy - after) / after.abs().max(f64::MIN_POSITIVE);
         (uv, energy, gradient) = (moved, after, next_gradient);
         summary.iterations += 1;
@@ -188,9 +180,7 @@ struct Problem<'a> {
     /// Faces that start flipped: rigid energy instead of the barrier.
     loose: Vec<bool>,
     loose_count: usize,
-    /// Where the gradients of each vertex' corners are: compressed rows of corner numbers.
-    first_corner: Vec<u32>,
-    corners: Vec<u32>,
+    corner_sums: CornerSums,
     /// Energy below which everything is rounding.
     negligible: f64,
 }
@@ -224,17 +214,6 @@ impl<'a> Problem<'a> {
                 distortion::orientation(p) <= 0.0 || shape.jacobian(p).determinant() < 1e-6
             })
             .collect();
-        let mut first_corner = vec![0u32; mesh.vertices().len() + 1];
-        faces.iter().flatten().for_each(|&v| first_corner[v as usize + 1] += 1);
-        for v in 1..first_corner.len() {
-            first_corner[v] += first_corner[v - 1];
-        }
-        let mut fill = first_corner.clone();
-        let mut corners = vec![0u32; faces.len() * 3];
-        for (c, &v) in faces.iter().flatten().enumerate() {
-            corners[fill[v as usize] as usize] = c as u32;
-            fill[v as usize] += 1;
-        }
         Self {
             faces,
             shapes: &shapes.shapes,
@@ -245,8 +224,7 @@ impl<'a> Problem<'a> {
             ruler,
             loose_count: loose.iter().filter(|&&l| l).count(),
             loose,
-            first_corner,
-            corners,
+            corner_sums: CornerSums::new(mesh.vertices().len(), faces),
             negligible: 1e-14 * mesh.area(),
         }
     }
@@ -255,22 +233,14 @@ impl<'a> Problem<'a> {
         self.shapes[face].jacobian(self.faces[face].map(|v| uv[v as usize]))
     }
 
-    fn chunked_sum(&self, count: usize, value: impl Fn(usize) -> f64 + Sync) -> f64 {
-        let parts: Vec<f64> = (0..count.div_ceil(CHUNK))
-            .into_par_iter()
-            .map(|k| (k * CHUNK..((k + 1) * CHUNK).min(count)).map(&value).sum())
-            .collect();
-        parts.iter().sum()
-    }
-
     /// Energy of the ties.
     fn tie_energy(&self, uv: &[Vec2]) -> f64 {
-        self.chunked_sum(uv.len(), |v| self.tie[v] * (uv[v].x - self.chainage[v]).powi(2))
+        chunked_sum(uv.len(), |v| self.tie[v] * (uv[v].x - self.chainage[v]).powi(2))
     }
 
     /// Energy; infinite when a face that must not flip has.
     fn energy(&self, uv: &[Vec2]) -> f64 {
-        let isometry = self.chunked_sum(self.faces.len(), |f| {
+        let isometry = chunked_sum(self.faces.len(), |f| {
             let j = self.jacobian(f, uv);
             let area = self.shapes[f].area();
             let [tx, ty] = self.along[f];
@@ -301,7 +271,7 @@ impl<'a> Problem<'a> {
 
     fn rigid_gradient_and_energy(&self, uv: &[Vec2]) -> (Vec<Vec2>, f64) {
         let gradient = self.gather(uv, |_, j| rigid_slope(j));
-        let energy = self.chunked_sum(self.faces.len(), |f| {
+        let energy = chunked_sum(self.faces.len(), |f| {
             let j = self.jacobian(f, uv);
             let [tx, ty] = self.along[f];
             let rise = j.m21 * tx + j.m22 * ty;
@@ -312,68 +282,30 @@ impl<'a> Problem<'a> {
 
     /// Gradient with respect to the vertices from the derivative of the density with respect to J.
     fn gather(&self, uv: &[Vec2], slope: impl Fn(usize, &Mat2) -> Mat2 + Sync) -> Vec<Vec2> {
-        let of_corners: Vec<[Vec2; 3]> = (0..self.faces.len())
-            .into_par_iter()
-            .with_min_len(CHUNK)
-            .map(|f| {
-                let j = self.jacobian(f, uv);
-                let shape = &self.shapes[f];
-                let [tx, ty] = self.along[f];
-                let rise = j.m21 * tx + j.m22 * ty;
-                let mut s = slope(f, &j);
-                s.m21 += 2.0 * self.bearing * rise * tx;
-                s.m22 += 2.0 * self.bearing * rise * ty;
-                let s = s * shape.area();
-                let third = s.column(1) / shape.y;
-                let second = s.column(0) / shape.base - third * (shape.x / shape.base);
-                [-(second + third), second, third]
-            })
-            .collect();
-        (0..uv.len())
-            .into_par_iter()
-            .with_min_len(CHUNK)
-            .map(|v| {
-                let around = &self.corners[self.first_corner[v] as usize..self.first_corner[v + 1] as usize];
-                let mut sum = Vec2::new(2.0 * self.tie[v] * (uv[v].x - self.chainage[v]), 0.0);
-                for &c in around {
-                    sum += of_corners[(c / 3) as usize][(c % 3) as usize];
-                }
-                if self.ruler {
-                    sum.x = 0.0;
-                }
-                sum
-            })
-            .collect()
+        let tie = |v: usize| Vec2::new(2.0 * self.tie[v] * (uv[v].x - self.chainage[v]), 0.0);
+        let mut gradient = self.corner_sums.gather(tie, |f| {
+            let j = self.jacobian(f, uv);
+            let shape = &self.shapes[f];
+            let [tx, ty] = self.along[f];
+            let rise = j.m21 * tx + j.m22 * ty;
+            let mut s = slope(f, &j);
+            s.m21 += 2.0 * self.bearing * rise * tx;
+            s.m22 += 2.0 * self.bearing * rise * ty;
+            let s = s * shape.area();
+            let third = s.column(1) / shape.y;
+            let second = s.column(0) / shape.base - third * (shape.x / shape.base);
+            [-(second + third), second, third]
+        });
+        if self.ruler {
+            gradient.iter_mut().for_each(|g| g.x = 0.0);
+        }
+        gradient
     }
 
     /// How far one can go along `direction` before the first face flips, times [`SAFETY`].
     fn longest_step(&self, uv: &[Vec2], direction: &[Vec2]) -> f64 {
-        let first = (0..self.faces.len())
-            .into_par_iter()
-            .with_min_len(CHUNK)
-            .filter(|&f| !self.loose[f])
-            .map(|f| {
-                let corners = self.faces[f];
-                let [p0, p1, p2] = corners.map(|v| uv[v as usize]);
-                let [d0, d1, d2] = corners.map(|v| direction[v as usize]);
-                let (a, b, da, db) = (p1 - p0, p2 - p0, d1 - d0, d2 - d0);
-                first_positive_root(da.perp(&db), a.perp(&db) + da.perp(&b), a.perp(&b))
-            })
-            .reduce(|| f64::INFINITY, f64::min);
-        SAFETY * first
+        SAFETY * largest_flip_free_step(self.faces, uv, direction, |f| !self.loose[f])
     }
-}
-
-/// Smallest t > 0 with `a t^2 + b t + c = 0` for `c > 0`; infinite when there is none.
-fn first_positive_root(a: f64, b: f64, c: f64) -> f64 {
-    let discriminant = b * b - 4.0 * a * c;
-    if discriminant < 0.0 {
-        return f64::INFINITY;
-    }
-    // The stable pair of roots; c / q serves for a = 0 too.
-    let q = -0.5 * (b + discriminant.sqrt().copysign(b));
-    let positive = |t: f64| if t > 0.0 { t } else { f64::INFINITY };
-    positive(q / a).min(positive(c / q))
 }
 
 /// ((s1 - 1/s1)^2 + (s2 - 1/s2)^2) / 4, which is the symmetric Dirichlet density less its minimum.
@@ -382,17 +314,6 @@ fn isometric_density(j: &Mat2, determinant: f64) -> f64 {
     let skew = (j.m11 - j.m22).powi(2) + (j.m12 + j.m21).powi(2);
     let swelling = determinant - 1.0;
     (skew * (1.0 + 1.0 / (determinant * determinant)) + 2.0 * swelling * swelling / determinant) / 4.0
-}
-
-/// |J - R|^2 with the closest rotation R.
-fn rigid_density(j: &Mat2) -> f64 {
-    let turn = (j.m11 + j.m22).hypot(j.m21 - j.m12);
-    j.norm_squared() - 2.0 * turn + 2.0
-}
-
-/// Derivative of [`rigid_density`].
-fn rigid_slope(j: &Mat2) -> Mat2 {
-    (j - crate::numeric::svd2x2::closest_rotation(j)) * 2.0
 }
 
 /// The Hessian of the rigid energy and the ties, factored: one system for u, one for v.
@@ -426,7 +347,7 @@ impl Preconditioner {
         }
         // v is tied by nothing to a place; a tie far below the isometry's weight holds its mean.
         for j in 0..count {
-            let unused = problem.first_corner[j] == problem.first_corner[j + 1];
+            let unused = !problem.corner_sums.is_used(j);
             u[pattern.diagonal(j)] += if unused { 1.0 } else { 2.0 * problem.tie[j] };
             v[pattern.diagonal(j)] += if unused { 1.0 } else { 2.0 * problem.tie[j].max(f64::MIN_POSITIVE) };
         }
@@ -452,58 +373,6 @@ impl Preconditioner {
         );
         u.into_iter().zip(v).map(|(x, y)| Vec2::new(x, y)).collect()
     }
-}
-
-/// A remembered step: displacement, change of the gradient, and their product.
-struct Pair {
-    step: Vec<Vec2>,
-    change: Vec<Vec2>,
-    curvature: f64,
-}
-
-impl Pair {
-    fn new(from: &[Vec2], to: &[Vec2], gradient_from: &[Vec2], gradient_to: &[Vec2]) -> Self {
-        let step: Vec<Vec2> = to.iter().zip(from).map(|(b, a)| b - a).collect();
-        let change: Vec<Vec2> = gradient_to.iter().zip(gradient_from).map(|(b, a)| b - a).collect();
-        let curvature = dot(&step, &change);
-        Self { step, change, curvature }
-    }
-}
-
-/// The two-loop recursion of L-BFGS (J. Nocedal, Mathematics of Computation 35, 1980,
-/// doi:10.1090/S0025-5718-1980-0572855-7).
-fn quasi_newton_direction(gradient: &[Vec2], history: &VecDeque<Pair>, step: &Preconditioner) -> Vec<Vec2> {
-    let mut q = gradient.to_vec();
-    let mut shares = Vec::with_capacity(history.len());
-    for pair in history.iter().rev() {
-        let share = dot(&pair.step, &q) / pair.curvature;
-        add(&mut q, &pair.change, -share);
-        shares.push(share);
-    }
-    let mut r = step.apply(&q, 1.0);
-    for (pair, share) in history.iter().zip(shares.into_iter().rev()) {
-        let back = dot(&pair.change, &r) / pair.curvature;
-        add(&mut r, &pair.step, share - back);
-    }
-    r.par_iter_mut().with_min_len(CHUNK).for_each(|d| *d = -*d);
-    r
-}
-
-fn dot(a: &[Vec2], b: &[Vec2]) -> f64 {
-    let parts: Vec<f64> = a
-        .par_chunks(CHUNK)
-        .zip(b.par_chunks(CHUNK))
-        .map(|(a, b)| a.iter().zip(b).map(|(p, q)| p.dot(q)).sum())
-        .collect();
-    parts.iter().sum()
-}
-
-fn add(to: &mut [Vec2], what: &[Vec2], times: f64) {
-    to.par_iter_mut().with_min_len(CHUNK).zip(what).for_each(|(p, q)| *p += q * times);
-}
-
-fn advance(uv: &[Vec2], direction: &[Vec2], length: f64) -> Vec<Vec2> {
-    uv.par_iter().with_min_len(CHUNK).zip(direction).map(|(p, d)| p + d * length).collect()
 }
 
 #[cfg(test)]
@@ -552,14 +421,6 @@ mod tests {
                 assert!((slope - gradient[v][axis]).abs() < 1e-5 * (1.0 + slope.abs()), "{v} {axis}: {slope}");
             }
         }
-    }
-
-    #[test]
-    fn the_first_flip_is_found() {
-        assert_eq!(first_positive_root(0.0, -2.0, 1.0), 0.5);
-        assert_eq!(first_positive_root(0.0, 2.0, 1.0), f64::INFINITY);
-        assert!((first_positive_root(1.0, -3.0, 2.0) - 1.0).abs() < 1e-15);
-        assert_eq!(first_positive_root(1.0, 0.0, 1.0), f64::INFINITY);
     }
 
     #[test]

@@ -27,17 +27,19 @@
 //! both are counted in the summary. The proximal weight is 1e-4 of the mean diagonal instead of an absolute 1e-4.
 //! Cost: one Cholesky factorization of the number of vertices, then about ten solves with it an iteration.
 
-use super::conformal::used_vertices;
+use super::corner_sums::CornerSums;
 use super::distortion::orientation;
 use super::finish::finish;
+use super::flip_free_step::largest_flip_free_step;
 use super::guide::Guide;
+use super::quasi_newton::{advance, dot};
 use super::start::start_without_flips;
 use super::triangle_shapes::{Shape, Shapes};
-use super::{Error, SolveSummary};
+use super::{Error, SolveSummary, stopping};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
 use crate::numeric::sparse::{self, Analysis, Cholesky, Pattern};
-use crate::numeric::{Mat2, Vec2};
+use crate::numeric::{Mat2, Vec2, conjugate_gradients};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -74,9 +76,7 @@ impl Default for Settings {
 /// # Errors
 /// [`Error::Solve`] when there is no start without flips or a system cannot be solved, [`Error::Setting`].
 pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Result<(Vec<Vec2>, SolveSummary), Error> {
-    if !(settings.tolerance >= 0.0) {
-        return Err(Error::Setting { key: "slim.tolerance", value: settings.tolerance, must: "0 or more" });
-    }
+    stopping::not_negative("slim.tolerance", settings.tolerance)?;
     let mesh = strip.mesh();
     let shapes = Shapes::of(mesh);
     let mut summary = SolveSummary::default();
@@ -104,16 +104,16 @@ fn minimize(
             .into_par_iter()
             .map(|(corners, shape)| FaceWeight::at(shape, corners.map(|v| uv[v as usize])))
             .collect();
-        let gradient = gradient(mesh.faces(), &shapes.shapes, &faces, uv.len());
+        let gradient = gradient(&solver.corner_sums, &shapes.shapes, &faces);
         let step = solver.solve(mesh, shapes, &faces, &gradient)?;
-        let slope: f64 = -gradient.iter().zip(&step).map(|(g, d)| g.dot(d)).sum::<f64>() / area;
-        let largest = largest_flip_free_step(mesh.faces(), uv, &step);
+        let slope = -dot(&gradient, &step) / area;
+        let largest = largest_flip_free_step(mesh.faces(), uv, &step, |_| true);
         let mut length = 1.0f64.min(BACK_FROM_FLIP * largest);
         let before = energy;
         // The energy is a barrier: halving ends, but at rounding level there is nothing left to gain.
         let moved = (slope > 0.0).then_some(60).and_then(|halvings| {
             (0..halvings).find_map(|_| {
-                let candidate: Vec<Vec2> = uv.iter().zip(&step).map(|(p, d)| p + d * length).collect();
+                let candidate = advance(uv, &step, length);
                 let value = dirichlet_energy(mesh.faces(), &shapes.shapes, &candidate) / area;
                 let accepted = value <= before - ARMIJO * length * slope;
                 length *= 0.5;
@@ -186,54 +186,16 @@ fn dirichlet_energy(faces: &[[u32; 3]], shapes: &[Shape], uv: &[Vec2]) -> f64 {
     each.iter().sum()
 }
 
-/// Derivatives of corner values: the gradient of the hat function of each corner times the area.
-fn hat_gradients(shape: &Shape) -> [[f64; 2]; 3] {
-    let Shape { base, x, y } = *shape;
-    [[-y / 2.0, (x - base) / 2.0], [y / 2.0, -x / 2.0], [0.0, base / 2.0]]
-}
-
 /// Gradient of the energy sum with respect to the vertices.
-fn gradient(faces: &[[u32; 3]], shapes: &[Shape], weights: &[FaceWeight], n: usize) -> Vec<Vec2> {
-    let mut gradient = vec![Vec2::zeros(); n];
-    for ((corners, shape), weight) in faces.iter().zip(shapes).zip(weights) {
-        for (&v, [p, q]) in corners.iter().zip(hat_gradients(shape)) {
-            gradient[v as usize] += (weight.stress * Vec2::new(p, q)) * 2.0;
-        }
-    }
-    gradient
-}
-
-/// The largest multiple of `step` before a face loses its area; infinite when none does.
-fn largest_flip_free_step(faces: &[[u32; 3]], uv: &[Vec2], step: &[Vec2]) -> f64 {
-    faces
-        .par_iter()
-        .map(|corners| {
-            let p = corners.map(|v| uv[v as usize]);
-            let d = corners.map(|v| step[v as usize]);
-            let (e, f, de, df) = (p[1] - p[0], p[2] - p[0], d[1] - d[0], d[2] - d[0]);
-            // Double area along the step: c + b t + a t^2, with c > 0.
-            let (a, b, c) = (de.perp(&df), e.perp(&df) + de.perp(&f), e.perp(&f));
-            smallest_positive_root(a, b, c)
-        })
-        .reduce(|| f64::INFINITY, f64::min)
-}
-
-/// The smallest positive root of `a t^2 + b t + c` with `c > 0`, or infinity. Stable for tiny `a`.
-fn smallest_positive_root(a: f64, b: f64, c: f64) -> f64 {
-    let discriminant = b * b - 4.0 * a * c;
-    if discriminant < 0.0 {
-        return f64::INFINITY;
-    }
-    let q = -0.5 * (b + discriminant.sqrt().copysign(b));
-    let roots = [if a == 0.0 { f64::INFINITY } else { q / a }, if q == 0.0 { f64::INFINITY } else { c / q }];
-    roots.into_iter().filter(|t| *t > 0.0).fold(f64::INFINITY, f64::min)
+fn gradient(corner_sums: &CornerSums, shapes: &[Shape], weights: &[FaceWeight]) -> Vec<Vec2> {
+    corner_sums.gather(|_| Vec2::zeros(), |f| shapes[f].hat_gradients().map(|g| (weights[f].stress * g) * 2.0))
 }
 
 /// Solves for the step of the weighted form.
 struct WeightedSolver {
     edges: Pattern,
+    corner_sums: CornerSums,
     proximal: f64,
-    used: Vec<bool>,
     laplacian: Cholesky,
     /// The 2x2 block form, made when the iterations fail for the first time.
     block: Option<(Pattern, Analysis)>,
@@ -254,8 +216,8 @@ impl WeightedSolver {
         values.iter_mut().for_each(|v| *v *= 4.0);
         edges.add_to_diagonal(&mut values, |_| proximal);
         let laplacian = Cholesky::of(&edges, &values)?;
-        let used = used_vertices(n, faces);
-        Ok(Self { edges, proximal, used, laplacian, block: None, steps: 0, factorizations: 0 })
+        let corner_sums = CornerSums::new(n, faces);
+        Ok(Self { edges, corner_sums, proximal, laplacian, block: None, steps: 0, factorizations: 0 })
     }
 
     /// The step `-H^-1 gradient / 2` with `H` the weighted form plus the proximal term.
@@ -267,73 +229,37 @@ impl WeightedSolver {
         gradient: &[Vec2],
     ) -> Result<Vec<Vec2>, sparse::Error> {
         let right: Vec<Vec2> = gradient.iter().map(|g| g * -0.5).collect();
-        match self.conjugate_gradients(mesh, shapes, weights, &right) {
-            Some(step) => Ok(step),
-            None => self.direct(mesh, shapes, weights, &right),
+        if self.block.is_none() {
+            let n = right.len();
+            let split = |p: &[Vec2]| -> Vec<f64> { p.iter().map(|p| p.x).chain(p.iter().map(|p| p.y)).collect() };
+            let join = |x: &[f64]| -> Vec<Vec2> { (0..n).map(|v| Vec2::new(x[v], x[n + v])).collect() };
+            // Two solves with the Laplacian of an isometry.
+            let precondition = |r: &[f64]| {
+                let mut x = r.to_vec();
+                self.laplacian.solve_in_place(&mut x);
+                x
+            };
+            let multiply = |x: &[f64]| split(&self.multiply(mesh, shapes, weights, &join(x)));
+            let outcome = conjugate_gradients::solve(multiply, precondition, &split(&right), SOLVE_SHARE, MOST_STEPS);
+            self.steps += outcome.steps;
+            if outcome.converged {
+                return Ok(join(&outcome.x));
+            }
         }
+        self.direct(mesh, shapes, weights, &right)
     }
 
     /// `H x`, face by face.
     fn multiply(&self, mesh: &Mesh, shapes: &Shapes, weights: &[FaceWeight], x: &[Vec2]) -> Vec<Vec2> {
-        let mut y: Vec<Vec2> = x.iter().map(|p| p * self.proximal).collect();
-        for ((corners, shape), weight) in mesh.faces().iter().zip(&shapes.shapes).zip(weights) {
-            let j = shape.jacobian(corners.map(|v| x[v as usize]));
-            let stress = Mat2::new(weight.q[0], weight.q[1], weight.q[1], weight.q[2]) * j;
-            for (&v, [p, q]) in corners.iter().zip(hat_gradients(shape)) {
-                y[v as usize] += stress * Vec2::new(p, q);
-            }
-        }
-        y
-    }
-
-    /// The preconditioner: two solves with the Laplacian of an isometry.
-    fn precondition(&self, r: &[Vec2]) -> Vec<Vec2> {
-        let n = r.len();
-        let mut x: Vec<f64> = r.iter().map(|p| p.x).chain(r.iter().map(|p| p.y)).collect();
-        self.laplacian.solve_in_place(&mut x);
-        (0..n).map(|v| Vec2::new(x[v], x[n + v])).collect()
-    }
-
-    fn conjugate_gradients(
-        &mut self,
-        mesh: &Mesh,
-        shapes: &Shapes,
-        weights: &[FaceWeight],
-        right: &[Vec2],
-    ) -> Option<Vec<Vec2>> {
-        if self.block.is_some() {
-            return None;
-        }
-        let dot = |a: &[Vec2], b: &[Vec2]| a.iter().zip(b).map(|(p, q)| p.dot(q)).sum::<f64>();
-        let mut x = vec![Vec2::zeros(); right.len()];
-        let mut r = right.to_vec();
-        let mut z = self.precondition(&r);
-        let mut p = z.clone();
-        let mut rz = dot(&r, &z);
-        let goal = rz * SOLVE_SHARE * SOLVE_SHARE;
-        if rz <= 0.0 {
-            return Some(x);
-        }
-        for _ in 0..MOST_STEPS {
-            self.steps += 1;
-            let hp = self.multiply(mesh, shapes, weights, &p);
-            let curvature = dot(&p, &hp);
-            if !(curvature > 0.0) {
-                return None;
-            }
-            let alpha = rz / curvature;
-            x.iter_mut().zip(&p).for_each(|(x, p)| *x += p * alpha);
-            r.iter_mut().zip(&hp).for_each(|(r, h)| *r -= h * alpha);
-            z = self.precondition(&r);
-            let next = dot(&r, &z);
-            if next <= goal {
-                return Some(x);
-            }
-            let beta = next / rz;
-            rz = next;
-            p.iter_mut().zip(&z).for_each(|(p, z)| *p = z + *p * beta);
-        }
-        None
+        self.corner_sums.gather(
+            |v| x[v] * self.proximal,
+            |f| {
+                let (shape, weight) = (&shapes.shapes[f], &weights[f]);
+                let j = shape.jacobian(mesh.faces()[f].map(|v| x[v as usize]));
+                let stress = Mat2::new(weight.q[0], weight.q[1], weight.q[1], weight.q[2]) * j;
+                shape.hat_gradients().map(|g| stress * g)
+            },
+        )
     }
 
     /// Assembles and factors the block form.
@@ -346,7 +272,7 @@ impl WeightedSolver {
     ) -> Result<Vec<Vec2>, sparse::Error> {
         if self.block.is_none() {
             let pattern = self.edges.two_per_node()?;
-            let analysis = Analysis::new(&pattern)?;
+            let analysis = Analysis::of_paired(&self.edges, &pattern)?;
             self.block = Some((pattern, analysis));
         }
         let (pattern, analysis) = self.block.as_ref().expect("just made");
@@ -363,15 +289,15 @@ impl WeightedSolver {
             }
         };
         for ((corners, shape), weight) in mesh.faces().iter().zip(&shapes.shapes).zip(weights) {
-            let hats = hat_gradients(shape);
+            let hats = shape.hat_gradients();
             for a in 0..3 {
                 for b in a..3 {
-                    let k = (hats[a][0] * hats[b][0] + hats[a][1] * hats[b][1]) / shape.area();
+                    let k = hats[a].dot(&hats[b]) / shape.area();
                     add(corners[a], corners[b], k, weight.q);
                 }
             }
         }
-        pattern.add_to_diagonal(&mut values, |j| if self.used[j / 2] { self.proximal } else { 1.0 });
+        pattern.add_to_diagonal(&mut values, |j| if self.corner_sums.is_used(j / 2) { self.proximal } else { 1.0 });
         let factor = Cholesky::new(pattern, analysis, &values)?;
         self.factorizations += 1;
         let mut x: Vec<f64> = right.iter().flat_map(|p| [p.x, p.y]).collect();
@@ -391,7 +317,7 @@ mod tests {
         let p = [Vec2::new(0.1, 0.0), Vec2::new(2.0, 0.5), Vec2::new(0.2, 0.9)];
         let faces = [[0u32, 1, 2]];
         let weights = [FaceWeight::at(&shape, p)];
-        let g = gradient(&faces, &[shape], &weights, 3);
+        let g = gradient(&CornerSums::new(3, &faces), &[shape], &weights);
         for i in 0..3 {
             for k in 0..2 {
                 let at = |d: f64| {
@@ -405,16 +331,6 @@ mod tests {
         }
         let isometry = FaceWeight::at(&shape, shape.corners());
         assert!((isometry.q[0] - 4.0).abs() < 1e-12 && isometry.q[1].abs() < 1e-12 && isometry.stress.norm() < 1e-12);
-    }
-
-    #[test]
-    fn a_step_stops_where_a_face_loses_its_area() {
-        let uv = [Vec2::zeros(), Vec2::x(), Vec2::y()];
-        let step = [Vec2::zeros(), Vec2::zeros(), Vec2::new(0.0, -2.0)];
-        assert_eq!(largest_flip_free_step(&[[0, 1, 2]], &uv, &step), 0.5);
-        assert_eq!(largest_flip_free_step(&[[0, 1, 2]], &uv, &[Vec2::x(); 3]), f64::INFINITY);
-        assert!((smallest_positive_root(1.0, -3.0, 2.0) - 1.0).abs() < 1e-15);
-        assert!((smallest_positive_root(1e-300, -1.0, 1.0) - 1.0).abs() < 1e-15);
     }
 
     #[test]
@@ -447,8 +363,8 @@ mod tests {
         let uv = super::super::start::start("slim", &known.strip, None, &shapes, &mut SolveSummary::default()).unwrap();
         let pairs = mesh.faces().iter().zip(&shapes.shapes);
         let weights: Vec<FaceWeight> = pairs.map(|(c, s)| FaceWeight::at(s, c.map(|v| uv[v as usize]))).collect();
-        let right = gradient(mesh.faces(), &shapes.shapes, &weights, uv.len());
         let mut solver = WeightedSolver::new(mesh, &shapes).unwrap();
+        let right = gradient(&solver.corner_sums, &shapes.shapes, &weights);
         let direct = solver.direct(mesh, &shapes, &weights, &right).unwrap();
         let back = solver.multiply(mesh, &shapes, &weights, &direct);
         let largest = right.iter().map(|r| r.amax()).fold(0.0, f64::max);

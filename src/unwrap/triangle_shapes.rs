@@ -9,6 +9,7 @@
 use crate::mesh::{FaceId, Mesh};
 use crate::numeric::Vec2;
 use crate::warning::Warning;
+use rayon::prelude::*;
 
 /// Margin of the triangle inequality as a share of the mean edge length of the mesh. Cotangents stay below about its
 /// inverse root, which costs half the digits of a solve and no more.
@@ -63,6 +64,13 @@ impl Shape {
         [Vec2::zeros(), Vec2::new(self.base, 0.0), Vec2::new(self.x, self.y)]
     }
 
+    /// For each corner the gradient of its hat function (1 there, 0 at the others) times the area: half the opposite edge,
+    /// turned by a quarter.
+    pub fn hat_gradients(&self) -> [Vec2; 3] {
+        let Self { base, x, y } = *self;
+        [Vec2::new(-y, x - base) / 2.0, Vec2::new(y, -x) / 2.0, Vec2::new(0.0, base) / 2.0]
+    }
+
     /// The Jacobian of the linear map that takes the shape's corners to `p`.
     pub fn jacobian(&self, p: [Vec2; 3]) -> crate::numeric::Mat2 {
         let first = (p[1] - p[0]) / self.base;
@@ -87,25 +95,26 @@ impl Shapes {
             let [a, b, c] = faces[f].map(|v| vertices[v as usize]);
             [(b - a).norm(), (c - b).norm(), (a - c).norm()]
         };
-        let total: f64 = (0..faces.len()).map(|f| lengths(f).iter().sum::<f64>()).sum();
+        let lengths: Vec<[f64; 3]> = (0..faces.len()).into_par_iter().map(lengths).collect();
+        let total: f64 = lengths.iter().map(|l| l.iter().sum::<f64>()).sum();
         let mean = total / (3 * faces.len()).max(1) as f64;
         // All vertices in one point: any unit will do.
         let margin = MARGIN * if mean > 0.0 { mean } else { 1.0 };
-        let mut repaired = Vec::new();
+        let slack = |[a, b, c]: [f64; 3]| (a + b - c).min(b + c - a).min(c + a - b);
         let shapes = (0..faces.len())
+            .into_par_iter()
             .map(|f| {
-                let [a, b, c] = lengths(f);
-                let slack = (a + b - c).min(b + c - a).min(c + a - b);
+                let slack = slack(lengths[f]);
                 if slack >= margin {
                     // The coordinates come from the vectors, not from lengths: no digits are lost for slivers.
                     let [p, q, r] = faces[f].map(|v| vertices[v as usize]);
-                    let (e, g) = (q - p, r - p);
+                    let (a, e, g) = (lengths[f][0], q - p, r - p);
                     return Shape { base: a, x: e.dot(&g) / a, y: e.cross(&g).norm() / a };
                 }
-                repaired.push(f as FaceId);
-                Shape::from_lengths([a, b, c].map(|l| l + (margin - slack)))
+                Shape::from_lengths(lengths[f].map(|l| l + (margin - slack)))
             })
             .collect();
+        let repaired = (0..faces.len()).filter(|&f| !(slack(lengths[f]) >= margin)).map(|f| f as FaceId).collect();
         Self { shapes, repaired }
     }
 
