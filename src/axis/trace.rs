@@ -32,6 +32,10 @@ const HALF_OPEN: f64 = 0.62;
 /// Share of the surface that must border on the enclosed space: for a tunnel, and for a half-open one.
 const LEAST_SHARE: f64 = 0.25;
 const LEAST_SHARE_HALF_OPEN: f64 = 0.6;
+/// Share of the surface that must border on the strictly enclosed space for its loops to be loops of tunnels.
+const LEAST_SHARE_OF_LOOP: f64 = 0.5;
+/// Code of the warning that the space is enclosed only when one side may be open.
+const HALF_OPEN_SECTION: &str = "half-open-section";
 /// Length over width that is at least needed: for a tunnel, and for a half-open one.
 const LEAST_ASPECT: f64 = 0.5;
 const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
@@ -39,6 +43,8 @@ const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
 const REACH_RADII: f64 = 8.0;
 /// The tunnel ends where less than this share of the usual directions is covered.
 const PORTAL_COVERAGE: f64 = 0.72;
+/// Usual share of directions with surface below which there is no section: one wall of a tunnel has half.
+const LEAST_COVERAGE: f64 = 0.3;
 /// In the outermost slice the tunnel begins where this share of the directions has begun.
 const BEGUN: f64 = 0.15;
 /// Steeper than this from end to end, chainage runs downwards.
@@ -198,12 +204,22 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let mut warnings = Vec::new();
     let ends = settings.ends.map(|e| e.map(Vec3::from));
     let mut void = find_void(&sample, &spacing, false, &mut warnings)?;
+    let strictly = !warnings.iter().any(|w| w.code == HALF_OPEN_SECTION);
+    let strict_share = if strictly { void.enclosed_share } else { 0.0 };
     let mut skeleton = skeleton::skeleton(&void, ends);
     if skeleton.loop_arm_m.is_some() && ends.is_none() {
         // In a very short tunnel only a ring along the wall is well enclosed; with more patience its middle is too.
         void = find_void(&sample, &spacing, true, &mut warnings)?;
         skeleton = skeleton::skeleton(&void, ends);
         if let Some(arm_m) = skeleton.loop_arm_m {
+            // Hollows of an outcrop hang together in circles too; the walls of a loop of tunnels nearly all face it.
+            if strict_share < LEAST_SHARE_OF_LOOP {
+                return Err(not_a_tunnel(
+                    "what is enclosed runs in circles and too little of the surface faces it",
+                    Some(&void),
+                    length_of(&void),
+                ));
+            }
             return Err(Error::ClosedLoop { arm_m });
         }
     }
@@ -215,6 +231,9 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
     let (range, coverage) = covered_range(&surface, &refined, least_step_m)
         .ok_or_else(|| not_a_tunnel("no section is covered well enough", Some(&void), rough.length()))?;
+    if coverage < LEAST_COVERAGE {
+        return Err(not_a_tunnel("too little of any section around the axis has surface", Some(&void), rough.length()));
+    }
     let knots = knots_between(&refined.axis, range, refined.radius_m);
     let start_chainage = settings.start_chainage_m.unwrap_or(0.0);
     let forwards = Axis::through(&knots, start_chainage)?;
@@ -324,7 +343,7 @@ fn find_void(
                 "the section is open on one side (a trench, or a floor or roof that was not scanned); the axis follows \
                  what is there"
             };
-            warnings.push(Warning::new("half-open-section", message));
+            warnings.push(Warning::new(HALF_OPEN_SECTION, message));
             return Ok(open.expect("just looked at"));
         }
         return Err(not_a_tunnel("the enclosed space is not elongated", Some(void), length_m));

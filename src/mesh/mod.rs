@@ -1,14 +1,21 @@
 //! Triangle meshes: plain indexed arrays plus derived topology.
 
 pub mod reconstruct;
-pub mod repair;
+pub mod openings;
 pub mod section;
+pub mod implicit;
+mod void_side;
+mod surface_nets;
+pub mod repair;
+mod handles;
+mod fill;
+pub mod decimate;
 pub mod anchor;
 pub mod nearest_face;
 pub mod surface_point;
 pub mod topology;
 
-pub use reconstruct::{Settings, Summary, reconstruct};
+pub use reconstruct::{Method, Settings, Summary, is_in_pieces, reconstruct, sample_faces, take_over};
 pub use surface_point::SurfacePoint;
 
 use crate::numeric::Vec3;

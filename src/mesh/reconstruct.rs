@@ -1,16 +1,46 @@
-//! The verb of the mesh stage: from classified points to one oriented manifold.
+//! The verb of the mesh stage: from classified points, or from faces made elsewhere, to one oriented manifold.
 
-use super::{Mesh, section};
+use super::decimate::{self, Decimate};
+use super::openings::{self, SideOpening, SideOpenings};
+use super::{Mesh, VertexId, implicit, repair, section, topology};
 use crate::axis::Axis;
-use crate::segment::Segmentation;
+use crate::numeric::{Vec3, wrap_angle};
+use crate::segment::{Class, Segmentation};
 use crate::warning::Warning;
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::f64::consts::TAU;
+
+/// Above this share of cells with several depths the section method loses too much of the surface, percent.
+const MANY_DEPTHS_PERCENT: f64 = 5.0;
+/// Above this share of points in front of the surface, these are rough rock and no furniture.
+const MUCH_FURNITURE: f64 = 0.1;
+/// Above this share the mean section says nothing.
+const MOSTLY_IN_FRONT: f64 = 0.4;
+/// A mesh from elsewhere is taken as it is when its largest piece has this share of the area.
+const ONE_PIECE: f64 = 0.9;
+/// Points that stand for the pieces of a mesh.
+const SAMPLE: usize = 800_000;
+
+/// Which method makes the surface.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    #[default]
+    /// Depth over the unrolled mean section: tunnels, drifts, sewers, shafts.
+    Section,
+    /// Zero surface of a local signed distance: caves, junctions, deep overhangs.
+    Implicit,
+}
 
 /// How the surface is made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
+    /// `"section"` for tunnels, drifts, sewers and shafts, `"implicit"` to keep what hides behind itself; the section
+    /// method warns when much does.
+    pub method: Method,
     /// Distance between neighbouring vertices in metres; by default about one vertex for 1.5 points, but not finer than
     /// 1/600 of the tunnel's perimeter.
     pub spacing_m: Option<f64>,
@@ -20,20 +50,34 @@ pub struct Settings {
     /// Holes narrower than this are filled and marked as filled, metres; 0 fills none.
     pub fill_hole_m: f64,
     /// The wall behind ducts, cables and other furniture is filled and marked where its shadow is narrower than this,
-    /// metres; 0 leaves holes.
+    /// metres; 0 leaves holes. Only the section method knows where the wall goes on.
     pub fill_behind_furniture_m: f64,
+    /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim,
+    /// `"close"` closes it there and marks it filled (the section method only), `"keep"` keeps what was seen of it.
+    pub side_openings: SideOpenings,
+    /// Thins the mesh: `{ faces = N }` down to a number of faces, `{ deviation_m = X }` as far as the surface moves no
+    /// more than that. Not thinned when not given.
+    pub decimate: Option<Decimate>,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { spacing_m: None, max_gap_m: 0.05, fill_hole_m: 0.3, fill_behind_furniture_m: 1.5 }
+        Self {
+            method: Method::Section,
+            spacing_m: None,
+            max_gap_m: 0.05,
+            fill_hole_m: 0.3,
+            fill_behind_furniture_m: 1.5,
+            side_openings: SideOpenings::Hole,
+            decimate: None,
+        }
     }
 }
 
 /// What was built, for the report.
 #[derive(Clone, Debug, Serialize)]
 pub struct Summary {
-    /// The method that was used.
+    /// The method that was used: `section`, `implicit`, or `given` for a mesh from elsewhere.
     pub method: &'static str,
     /// Why it was chosen.
     pub reason: String,
@@ -47,8 +91,20 @@ pub struct Summary {
     pub filled_percent: f64,
     /// Boundary loops: two portals and the holes that stayed.
     pub boundary_loops: usize,
+    /// Side drifts, niches and rooms that open into the wall.
+    pub openings: Vec<SideOpening>,
     /// Numbers of the section method.
-    pub section: section::Summary,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub section: Option<section::Summary>,
+    /// Numbers of the implicit method.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub implicit: Option<implicit::Summary>,
+    /// What was thinned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub decimate: Option<decimate::Summary>,
+    /// What was repaired.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repair: Option<repair::Summary>,
     /// What a person should know.
     pub warnings: Vec<Warning>,
 }
@@ -67,6 +123,15 @@ pub enum Error {
         /// What is allowed.
         must: &'static str,
     },
+    /// Two settings that do not go together.
+    #[error("mesh.side_openings = \"close\" needs the section method, but {reason}; use \"hole\"")]
+    CannotClose {
+        /// Why the section method is not used.
+        reason: String,
+    },
+    /// `decimate` without a limit.
+    #[error("mesh.decimate needs `faces` or `deviation_m`: how far to thin")]
+    NothingToDecimate,
     /// No part of the surface has enough points.
     #[error("{points} points on the tunnel's surface make no connected surface; try a larger mesh.spacing_m")]
     NoSurface {
@@ -86,40 +151,260 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         max_gap_m: settings.max_gap_m,
         fill_hole_m: settings.fill_hole_m,
         fill_behind_furniture_m: settings.fill_behind_furniture_m,
+        side_openings: settings.side_openings,
     };
+    if settings.method == Method::Implicit {
+        let reason = "mesh.method = \"implicit\" was set".to_owned();
+        return by_distance(segmentation, axis, settings, &options, reason);
+    }
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
     let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
+    let share = section.multiple_depth_percent;
     let mut warnings = Vec::new();
-    if section.multiple_depth_percent > 5.0 {
+    if share > MANY_DEPTHS_PERCENT {
         warnings.push(Warning::new(
             "multiple-depths",
             format!(
-                "{:.1} % of the cells hold points at several distances from the axis; the section method keeps one",
-                section.multiple_depth_percent
+                "{share:.1} % of the cells hold points at several distances from the axis; the section method keeps one; \
+                 mesh.method = \"implicit\" keeps all"
             ),
         ));
     }
+    let front = segmentation.class.iter().filter(|c| **c == Class::Furniture).count();
+    if front as f64 > MOSTLY_IN_FRONT * (points + front) as f64 {
+        warnings.push(Warning::new(
+            "mostly-in-front",
+            format!(
+                "{:.0} % of the points stand in front of the rest and were left out: the tunnel is not understood as a \
+                 section that runs along an axis; mesh.method = \"implicit\" keeps them",
+                100.0 * front as f64 / (points + front) as f64
+            ),
+        ));
+    }
+    if !section.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
+        warnings.push(openings::warning(&section.openings, settings.side_openings));
+    }
+    let reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
+    let (mesh, thinned) = thin(mesh, settings);
+    let mut summary = describe("section", reason, &mesh, warnings);
+    summary.decimate = thinned;
+    summary.openings = section.openings.clone();
+    summary.section = Some(section);
+    Ok((mesh, summary))
+}
+
+/// The implicit method, cut off at the wall line and repaired.
+fn by_distance(
+    segmentation: &Segmentation,
+    axis: &Axis,
+    settings: &Settings,
+    options: &section::Options,
+    reason: String,
+) -> Result<(Mesh, Summary), Error> {
+    if settings.side_openings == SideOpenings::Close {
+        return Err(Error::CannotClose { reason });
+    }
+    let mut warnings = Vec::new();
+    let count = |class: Class| segmentation.class.iter().filter(|k| **k == class).count();
+    let front = count(Class::Furniture);
+    let surface = segmentation.class.iter().filter(|c| c.is_surface()).count();
+    let rock_in_front = front as f64 > MUCH_FURNITURE * (surface + front) as f64;
+    if rock_in_front {
+        warnings.push(Warning::new(
+            "furniture-kept",
+            format!(
+                "{:.0} % of the surface points stand in front of the rest, more than furniture does: they are taken for \
+                 rock and stay",
+                100.0 * front as f64 / (surface + front) as f64
+            ),
+        ));
+    }
+    let points: Vec<Vec3> = segmentation
+        .coordinates
+        .par_iter()
+        .zip(&segmentation.class)
+        .filter(|(_, k)| k.is_surface() || (rock_in_front && **k == Class::Furniture))
+        .map(|(c, _)| axis.point_at(c))
+        .collect();
+    let wall_line =
+        (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let implicit_options = implicit::Options {
+        spacing_m: settings.spacing_m,
+        max_gap_m: settings.max_gap_m,
+        fill_hole_m: settings.fill_hole_m,
+        perimeter_m: segmentation.section.mean_perimeter(),
+    };
+    let walls: Vec<Vec3> = segmentation
+        .coordinates
+        .par_iter()
+        .zip(&segmentation.class)
+        .filter(|(_, k)| **k != Class::Noise)
+        .map(|(c, _)| axis.point_at(c))
+        .collect();
+    let (raw, implicit) = implicit::reconstruct(points, &walls, axis, &implicit_options);
+    drop(walls);
+    let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
+    let mut openings = Vec::new();
+    if let Some(line) = wall_line {
+        surface_under_repair.retain(|[a, b, c]| !line.is_open(&axis.project(&((a + b + c) / 3.0)), segmentation));
+        openings = line.openings;
+        if !openings.is_empty() {
+            warnings.push(openings::warning(&openings, settings.side_openings));
+        }
+    }
+    let (mesh, repaired) = finish(surface_under_repair, axis, settings, &mut warnings);
+    if mesh.faces().is_empty() {
+        return Err(Error::NoSurface { points: surface });
+    }
+    let (mesh, thinned) = thin(mesh, settings);
+    let mut summary = describe("implicit", reason, &mesh, warnings);
+    summary.decimate = thinned;
+    summary.openings = openings;
+    summary.implicit = Some(implicit);
+    summary.repair = Some(repaired);
+    Ok((mesh, summary))
+}
+
+/// One component without handles, with its small holes closed.
+fn finish(
+    mut surface: repair::Repaired,
+    axis: &Axis,
+    settings: &Settings,
+    warnings: &mut Vec<Warning>,
+) -> (Mesh, repair::Summary) {
+    surface.keep_largest();
+    surface.cut_handles();
+    if settings.fill_hole_m > 0.0 {
+        surface.fill_holes(settings.fill_hole_m, |border| turns(axis, border) == 0);
+    }
+    // A cut may have parted what only hung together over the rim of a hole.
+    surface.keep_largest();
+    let (mesh, summary) = surface.into_mesh();
+    if summary.handles_cut > 0 {
+        warnings.push(Warning::new(
+            "handles-cut",
+            format!(
+                "{} handle(s) of the surface were cut open over {:.1} m, because a flat map cannot have them: places \
+                 where rock touches rock, or a way around a pillar",
+                summary.handles_cut, summary.handle_cuts_m
+            ),
+        ));
+    }
+    (mesh, summary)
+}
+
+/// Thins the mesh as the settings say.
+fn thin(mesh: Mesh, settings: &Settings) -> (Mesh, Option<decimate::Summary>) {
+    match &settings.decimate {
+        Some(target) => {
+            let (mesh, summary) = decimate::decimate(mesh, target);
+            (mesh, Some(summary))
+        }
+        None => (mesh, None),
+    }
+}
+
+/// Whole turns of a border around the axis.
+fn turns(axis: &Axis, border: &[Vec3]) -> i64 {
+    let angles: Vec<f64> = border.iter().map(|p| axis.project(p).angle()).collect();
+    let sum: f64 = (0..angles.len()).map(|i| wrap_angle(angles[(i + 1) % angles.len()] - angles[i])).sum();
+    (sum / TAU).round() as i64
+}
+
+/// Whether a mesh from elsewhere falls into pieces that have to be made into one surface: then [`sample_faces`] and
+/// [`reconstruct`] do that, else [`take_over`] repairs it as it is.
+pub fn is_in_pieces(vertices: &[Vec3], faces: &[[VertexId; 3]]) -> bool {
+    let mut all = repair::Repaired::given(vertices, faces, &vec![true; faces.len()]);
+    let area =
+        |(v, f): (&[Vec3], &[[VertexId; 3]])| -> f64 { f.iter().map(|c| area_of(c.map(|i| v[i as usize]))).sum() };
+    let before = area(all.parts());
+    all.keep_largest();
+    area(all.parts()) < ONE_PIECE * before
+}
+
+fn area_of([a, b, c]: [Vec3; 3]) -> f64 {
+    (b - a).cross(&(c - a)).norm() / 2.0
+}
+
+/// About 800,000 points spread evenly over the faces of a mesh, in the order of the faces.
+pub fn sample_faces(vertices: &[Vec3], faces: &[[VertexId; 3]]) -> Vec<Vec3> {
+    let corners = |f: &[VertexId; 3]| f.map(|v| vertices[v as usize]);
+    let total: f64 = faces.iter().map(|f| area_of(corners(f))).sum();
+    let each = total / SAMPLE as f64;
+    let mut points = Vec::with_capacity(SAMPLE + 1);
+    let mut owed = 0.5;
+    for face in faces {
+        let [a, b, c] = corners(face);
+        owed += if each > 0.0 { area_of([a, b, c]) / each } else { 0.0 };
+        while owed >= 1.0 {
+            owed -= 1.0;
+            // An additive recurrence in two dimensions covers a face evenly however many points it gets.
+            let k = points.len() as f64;
+            let (u, v) = ((k * 0.754_877_666_246_693).fract(), (k * 0.569_840_290_998_053).fract());
+            let root = u.sqrt();
+            points.push(a * (1.0 - root) + b * (root * (1.0 - v)) + c * (root * v));
+        }
+    }
+    points
+}
+
+/// Repairs a mesh from elsewhere: equal positions merged, faces turned to one side, edges of more than two faces and
+/// handles cut, the largest component kept, small holes filled and marked.
+///
+/// # Errors
+/// [`Error::Setting`], [`Error::NoSurface`].
+pub fn take_over(
+    vertices: &[Vec3],
+    faces: &[[VertexId; 3]],
+    observed: &[bool],
+    axis: &Axis,
+    settings: &Settings,
+) -> Result<(Mesh, Summary), Error> {
+    check(settings)?;
+    let surface = repair::Repaired::given(vertices, faces, observed);
+    let mut warnings = Vec::new();
+    let (mesh, repaired) = finish(surface, axis, settings, &mut warnings);
+    if mesh.faces().is_empty() {
+        return Err(Error::NoSurface { points: vertices.len() });
+    }
+    if repaired.faces_dropped > 0 {
+        warnings.push(Warning::new(
+            "components-dropped",
+            format!(
+                "{} smaller piece(s) of the mesh with {} faces were left out",
+                repaired.components_dropped, repaired.faces_dropped
+            ),
+        ));
+    }
+    let (mesh, thinned) = thin(mesh, settings);
+    let mut summary = describe("given", "the input is a mesh".to_owned(), &mesh, warnings);
+    summary.decimate = thinned;
+    summary.repair = Some(repaired);
+    Ok((mesh, summary))
+}
+
+fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<Warning>) -> Summary {
     let area_m2 = mesh.area();
     let filled: f64 = (0..mesh.faces().len())
         .filter(|&f| !mesh.observed()[f])
         .map(|f| mesh.double_area_vector(f as u32).norm() / 2.0)
         .sum();
-    let twin = super::topology::twins(mesh.faces()).expect("a Mesh is manifold");
-    let summary = Summary {
-        method: "section",
-        reason: format!(
-            "{:.2} % of the rays from the axis meet the surface more than once",
-            section.multiple_depth_percent
-        ),
+    let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
+    Summary {
+        method,
+        reason,
         vertices: mesh.vertices().len(),
         faces: mesh.faces().len(),
         area_m2,
         filled_percent: 100.0 * filled / area_m2,
-        boundary_loops: super::topology::boundary_loops(mesh.faces(), &twin).len(),
-        section,
+        boundary_loops: topology::boundary_loops(mesh.faces(), &twin).len(),
+        openings: Vec::new(),
+        section: None,
+        implicit: None,
+        decimate: None,
+        repair: None,
         warnings,
-    };
-    Ok((mesh, summary))
+    }
 }
 
 fn check(settings: &Settings) -> Result<(), Error> {
@@ -141,5 +426,104 @@ fn check(settings: &Settings) -> Result<(), Error> {
             return Err(Error::Setting { key, value, must: "must be 0 or a positive number of metres" });
         }
     }
-    Ok(())
+    match &settings.decimate {
+        Some(Decimate { faces: None, deviation_m: None }) => Err(Error::NothingToDecimate),
+        Some(Decimate { deviation_m: Some(value), .. }) if !positive(*value) => Err(Error::Setting {
+            key: "decimate.deviation_m",
+            value: *value,
+            must: "must be a positive number of metres",
+        }),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::segment::{self, classify_positions};
+
+    fn axis() -> Axis {
+        Axis::through(&[Vec3::zeros(), Vec3::new(20.0, 0.0, 0.0)], 0.0).unwrap()
+    }
+
+    /// Even points on a tube of 2 m radius and 20 m length around the x axis with a side drift of 1.6 m width and 5 m
+    /// depth on the left at 10 m.
+    fn drift() -> Vec<Vec3> {
+        let mut points: Vec<Vec3> = (0..240_000)
+            .map(|i| {
+                let s = 20.0 * (f64::from(i) * 0.618_033_988_749_895).fract();
+                let a = TAU * (f64::from(i) * 0.754_877_666_246_693).fract() - std::f64::consts::PI;
+                Vec3::new(s, -2.0 * a.sin(), 2.0 * a.cos())
+            })
+            .filter(|p| !(p.y > 0.0 && (p.x - 10.0).hypot(p.z) < 0.8))
+            .collect();
+        points.extend((0..25_000).map(|i| {
+            let y = 1.8 + 5.0 * (f64::from(i) * 0.618_033_988_749_895).fract();
+            let (sin, cos) = (TAU * (f64::from(i) * 0.754_877_666_246_693).fract()).sin_cos();
+            Vec3::new(10.0 + 0.8 * cos, y, 0.8 * sin)
+        }));
+        points
+    }
+
+    #[test]
+    fn a_side_drift_is_cut_off_at_the_wall_line_and_told() {
+        let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
+        for method in [Method::Section, Method::Implicit] {
+            let (mesh, summary) =
+                reconstruct(&segmentation, &axis(), &Settings { method, ..Settings::default() }).unwrap();
+            assert_eq!(summary.openings.len(), 1, "{method:?} {:?}", summary.openings);
+            let opening = &summary.openings[0];
+            assert!((opening.chainage_m - 10.0).abs() < 0.2 && opening.side == crate::axis::Side::Left);
+            assert!((opening.width_m[0] - 1.6).abs() < 0.4 && (opening.seen_depth_m - 4.7).abs() < 0.6, "{opening:?}");
+            assert!((Vec3::from(opening.ends_in_local[1]) - Vec3::new(10.0, 6.6, 0.0)).norm() < 0.5);
+            assert!(mesh.vertices().iter().all(|v| v.y.hypot(v.z) < 2.35), "{method:?}: nothing behind the wall line");
+            // The implicit method may leave a sliver of the rim open besides.
+            let most = if method == Method::Section { 3 } else { 5 };
+            assert!((3..=most).contains(&summary.boundary_loops), "{method:?}: {}", summary.boundary_loops);
+            assert!(summary.warnings.iter().any(|w| w.code == "side-openings"));
+        }
+    }
+
+    #[test]
+    fn a_mesh_in_pieces_is_told_from_one_in_one_piece() {
+        let tube = |shift: f64| -> (Vec<Vec3>, Vec<[u32; 3]>) {
+            let vertices = (0..21 * 24)
+                .map(|k: u32| {
+                    let (sin, cos) = (TAU * f64::from(k % 24) / 24.0).sin_cos();
+                    Vec3::new(f64::from(k / 24) + shift, 2.0 * cos, 2.0 * sin)
+                })
+                .collect();
+            let faces = (0..20 * 24u32)
+                .flat_map(|k| {
+                    let (i, j) = (k / 24, k % 24);
+                    let (a, b) = (i * 24 + j, i * 24 + (j + 1) % 24);
+                    [[a, a + 24, b + 24], [a, b + 24, b]]
+                })
+                .collect();
+            (vertices, faces)
+        };
+        let (mut vertices, mut faces) = tube(0.0);
+        assert!(!is_in_pieces(&vertices, &faces));
+        let points = sample_faces(&vertices, &faces);
+        assert!((points.len() as i64 - SAMPLE as i64).abs() <= 1);
+        assert!(points.iter().all(|p| (1.98..=2.0).contains(&p.y.hypot(p.z))));
+        let axis = axis();
+        let (mesh, summary) =
+            take_over(&vertices, &faces, &vec![true; faces.len()], &axis, &Settings::default()).unwrap();
+        assert_eq!((mesh.faces().len(), summary.boundary_loops), (faces.len(), 2));
+        let (more, corners) = tube(30.0);
+        let shift = vertices.len() as u32;
+        vertices.extend(more);
+        faces.extend(corners.iter().map(|f| f.map(|v| v + shift)));
+        assert!(is_in_pieces(&vertices, &faces));
+    }
+
+    #[test]
+    fn impossible_settings_are_refused() {
+        let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
+        let wrong = Settings { max_gap_m: 0.0, ..Settings::default() };
+        assert!(matches!(reconstruct(&segmentation, &axis(), &wrong), Err(Error::Setting { key: "max_gap_m", .. })));
+        let both = Settings { method: Method::Implicit, side_openings: SideOpenings::Close, ..Settings::default() };
+        assert!(matches!(reconstruct(&segmentation, &axis(), &both), Err(Error::CannotClose { .. })));
+    }
 }

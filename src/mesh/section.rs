@@ -21,9 +21,10 @@
 //! Guarantees: oriented manifold, faces counter-clockwise in (chainage, girth), no face wider than the cells it spans,
 //! same bytes on any number of threads. Cost: linear in points and cells; 24 bytes a point and 60 a cell.
 
+use super::openings::{self, SideOpening, SideOpenings};
 use super::repair;
 use super::{Mesh, VertexId};
-use crate::axis::Axis;
+use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::{Mat3, Vec3, statistics};
 use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint, squared_distance};
 use crate::segment::{Class, Segmentation};
@@ -62,6 +63,7 @@ pub(super) struct Options {
     pub max_gap_m: f64,
     pub fill_hole_m: f64,
     pub fill_behind_furniture_m: f64,
+    pub side_openings: SideOpenings,
 }
 
 /// What was done, for the report.
@@ -85,6 +87,9 @@ pub struct Summary {
     pub cells_bridged: usize,
     /// Cells in holes narrower than `fill_hole_m` that were filled.
     pub cells_filled: usize,
+    /// Side drifts, niches and rooms that open into the wall (told in [`super::reconstruct::Summary`]).
+    #[serde(skip)]
+    pub openings: Vec<SideOpening>,
     /// Vertices split because two parts of the surface touched in a point.
     pub vertices_split: usize,
     /// Components smaller than the largest that were dropped.
@@ -125,6 +130,11 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
     let mut places = fit_places(&grid, &cells, &clusters);
     drop(cells);
     let clusters = drop_bumps(&grid, clusters, &places, &mut summary);
+    let depth: Vec<f64> =
+        clusters.iter().zip(&places).map(|(c, p)| if c.count > 0 { p.depth } else { f64::NAN }).collect();
+    let (open, openings) = openings::find(&grid, segmentation, axis, &depth);
+    summary.openings = openings;
+    let clusters = cut_openings(&grid, clusters, &mut places, &open, options.side_openings);
     let mut furniture = vec![false; grid.len()];
     for (c, _) in segmentation.coordinates.iter().zip(&segmentation.class).filter(|(_, k)| **k == Class::Furniture) {
         let p = grid.unroll(section, c);
@@ -132,7 +142,7 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
             furniture[p.row as usize * grid.columns + (p.column as usize).min(grid.columns - 1)] = true;
         }
     }
-    let state = support(&grid, &clusters, &places, &furniture, along_gap, options, &mut summary);
+    let state = support(&grid, &clusters, &places, &furniture, &open, along_gap, options, &mut summary);
     fill_depths(&grid, &state, &mut places);
     // Between profiles whole rows have no points of their own; elsewhere a face needs a measured corner.
     let profiles = segmentation.sampling.is_profiles();
@@ -365,6 +375,58 @@ fn drop_bumps(grid: &Grid, clusters: Vec<Cluster>, places: &[GridPoint], summary
     kept
 }
 
+/// Where the wall line is, for surfaces that come from another method.
+pub(super) struct WallLine {
+    grid: Grid,
+    open: Vec<bool>,
+    behind_m: f64,
+    pub openings: Vec<SideOpening>,
+}
+
+impl WallLine {
+    /// Whether a place lies in a side opening or behind it.
+    pub fn is_open(&self, c: &AxisCoordinates, segmentation: &Segmentation) -> bool {
+        let p = self.grid.unroll(&segmentation.section, c);
+        if p.row < 0.0 || p.row >= self.grid.rows as f64 {
+            return false;
+        }
+        let cell = p.row as usize * self.grid.columns + (p.column as usize).min(self.grid.columns - 1);
+        // The cheeks of a side drift lie over the cells of its rim.
+        self.open[cell] || (p.depth > self.behind_m && self.grid.neighbours(cell, 2).any(|n| self.open[n]))
+    }
+}
+
+/// Finds the side openings without building the surface.
+pub(super) fn wall_line(segmentation: &Segmentation, axis: &Axis, options: &Options) -> WallLine {
+    let (grid, _) = choose_grid(segmentation, options);
+    let used = segmentation.coordinates.par_iter().zip(&segmentation.class);
+    let section = &segmentation.section;
+    let (cells, _) =
+        CellPoints::sort(&grid, used.map(|(c, class)| class.is_surface().then(|| grid.unroll(section, c))));
+    let clusters = choose_clusters(&grid, &cells, &mut Summary::default());
+    let depth: Vec<f64> = clusters.iter().map(|c| if c.count > 0 { c.middle } else { f64::NAN }).collect();
+    let (open, openings) = openings::find(&grid, segmentation, axis, &depth);
+    WallLine { behind_m: openings::behind_m(section), grid, open, openings }
+}
+
+/// Empties the cells of side openings, unless these are to be kept.
+fn cut_openings(
+    grid: &Grid,
+    mut clusters: Vec<Cluster>,
+    places: &mut [GridPoint],
+    open: &[bool],
+    what: SideOpenings,
+) -> Vec<Cluster> {
+    if what != SideOpenings::Keep {
+        for cell in (0..grid.len()).filter(|&c| open[c]) {
+            clusters[cell] = Cluster::default();
+            let (i, j) = ((cell / grid.columns) as f64 + 0.5, (cell % grid.columns) as f64 + 0.5);
+            places[cell] = GridPoint { row: i, column: j, depth: 0.0 };
+        }
+    }
+    clusters
+}
+
 /// Value and slopes at the origin of the weighted least-squares plane; slopes fade out where the samples do not tell.
 fn plane_at_origin(samples: &[[f64; 4]]) -> [f64; 3] {
     let mut normal = Mat3::zeros();
@@ -393,6 +455,7 @@ fn support(
     clusters: &[Cluster],
     places: &[GridPoint],
     furniture: &[bool],
+    open: &[bool],
     along_gap: f64,
     options: &Options,
     summary: &mut Summary,
@@ -430,6 +493,10 @@ fn support(
         .collect();
     // Stretch the metric of profile scans, so that a hole counts by its width around the section.
     let scale = [grid.row_m * around_gap / along_gap, grid.column_m];
+    if options.side_openings == SideOpenings::Close {
+        // Before the narrow gaps are closed, so that none stays along the rim.
+        state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = Node::Filled);
+    }
     if options.fill_hole_m > 0.0 {
         close(grid, &mut state, options.fill_hole_m / 2.0, scale, |_| true);
     }
@@ -439,6 +506,10 @@ fn support(
         let from_furniture = squared_distance(furniture, grid.rows, grid.columns, scale);
         let near = |n: usize| from_furniture[n] <= reach * reach;
         close(grid, &mut state, options.fill_behind_furniture_m / 2.0, scale, near);
+    }
+    // The rim of an opening is the wall line: no bridge leads into it.
+    if options.side_openings == SideOpenings::Hole {
+        state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = Node::Absent);
     }
     summary.cells_bridged = state.iter().filter(|s| matches!(s, Node::Near | Node::Bridged)).count();
     summary.cells_filled = state.iter().filter(|s| **s == Node::Filled).count();
@@ -670,8 +741,13 @@ mod tests {
         topology::boundary_loops(mesh.faces(), &topology::twins(mesh.faces()).unwrap()).len()
     }
 
-    const OPTIONS: Options =
-        Options { spacing_m: Some(0.05), max_gap_m: 0.05, fill_hole_m: 0.2, fill_behind_furniture_m: 0.0 };
+    const OPTIONS: Options = Options {
+        spacing_m: Some(0.05),
+        max_gap_m: 0.05,
+        fill_hole_m: 0.2,
+        fill_behind_furniture_m: 0.0,
+        side_openings: SideOpenings::Hole,
+    };
 
     #[test]
     fn a_tube_becomes_a_tube_that_faces_inwards() {

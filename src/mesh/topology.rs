@@ -22,52 +22,86 @@ pub fn previous(c: u32) -> u32 {
 /// # Errors
 /// [`Error::NotManifoldEdge`] when two half-edges run the same way between the same vertices.
 pub fn twins(faces: &[[VertexId; 3]]) -> Result<Vec<u32>, Error> {
-    // Half-edges in buckets by their lower vertex (a counting sort), each bucket sorted by (higher vertex, corner): much
-    // faster than one big sort or hashing, and deterministic.
-    let ends = |c: usize| {
-        let corners = &faces[c / 3];
-        (corners[c % 3], corners[(c + 1) % 3])
-    };
-    let buckets = faces.iter().flatten().max().map_or(0, |&v| v as usize + 1);
-    let mut start = vec![0u32; buckets + 1];
-    for c in 0..faces.len() * 3 {
-        let (a, b) = ends(c);
-        start[a.min(b) as usize + 1] += 1;
-    }
-    for v in 0..buckets {
-        start[v + 1] += start[v];
-    }
-    let mut fill = start.clone();
-    let mut edges = vec![(0u32, 0u32); faces.len() * 3];
-    for c in 0..faces.len() * 3 {
-        let (a, b) = ends(c);
-        let slot = &mut fill[a.min(b) as usize];
-        edges[*slot as usize] = (a.max(b), c as u32);
-        *slot += 1;
-    }
     let vertex = |c: u32| faces[(c / 3) as usize][(c % 3) as usize];
     let mut twin = vec![NO_TWIN; faces.len() * 3];
-    for bucket in 0..buckets {
-        let edges = &mut edges[start[bucket] as usize..start[bucket + 1] as usize];
-        edges.sort_unstable();
-        for group in edges.chunk_by(|x, y| x.0 == y.0) {
-            for (k, &(_, c)) in group.iter().enumerate() {
-                if let Some(&(_, same)) = group[..k].iter().find(|&&(_, other)| vertex(other) == vertex(c)) {
-                    return Err(Error::NotManifoldEdge {
-                        from: vertex(c),
-                        to: vertex(next(c)),
-                        first: same / 3,
-                        second: c / 3,
-                    });
-                }
+    for group in EdgeGroups::of(faces).iter() {
+        for (k, &(_, c)) in group.iter().enumerate() {
+            if let Some(&(_, same)) = group[..k].iter().find(|&&(_, other)| vertex(other) == vertex(c)) {
+                return Err(Error::NotManifoldEdge {
+                    from: vertex(c),
+                    to: vertex(next(c)),
+                    first: same / 3,
+                    second: c / 3,
+                });
             }
-            if let [(_, a), (_, b)] = *group {
-                twin[a as usize] = b;
-                twin[b as usize] = a;
-            }
+        }
+        if let [(_, a), (_, b)] = *group {
+            twin[a as usize] = b;
+            twin[b as usize] = a;
         }
     }
     Ok(twin)
+}
+
+/// [`twins`] for faces that need not be a manifold: half-edges of edges with more than two faces, or with two that run
+/// the same way, count as boundary; the second value lists them.
+pub fn lenient_twins(faces: &[[VertexId; 3]]) -> (Vec<u32>, Vec<u32>) {
+    let vertex = |c: u32| faces[(c / 3) as usize][(c % 3) as usize];
+    let mut twin = vec![NO_TWIN; faces.len() * 3];
+    let mut defects = Vec::new();
+    for group in EdgeGroups::of(faces).iter() {
+        match *group {
+            [_] => {}
+            [(_, a), (_, b)] if vertex(a) != vertex(b) => {
+                twin[a as usize] = b;
+                twin[b as usize] = a;
+            }
+            _ => defects.extend(group.iter().map(|g| g.1)),
+        }
+    }
+    (twin, defects)
+}
+
+/// Half-edges in buckets by their lower vertex (a counting sort), each bucket sorted by (higher vertex, corner): much
+/// faster than one big sort or hashing, and deterministic.
+struct EdgeGroups {
+    start: Vec<u32>,
+    edges: Vec<(u32, u32)>,
+}
+
+impl EdgeGroups {
+    fn of(faces: &[[VertexId; 3]]) -> Self {
+        let ends = |c: usize| {
+            let corners = &faces[c / 3];
+            (corners[c % 3], corners[(c + 1) % 3])
+        };
+        let buckets = faces.iter().flatten().max().map_or(0, |&v| v as usize + 1);
+        let mut start = vec![0u32; buckets + 1];
+        for c in 0..faces.len() * 3 {
+            let (a, b) = ends(c);
+            start[a.min(b) as usize + 1] += 1;
+        }
+        for v in 0..buckets {
+            start[v + 1] += start[v];
+        }
+        let mut fill = start.clone();
+        let mut edges = vec![(0u32, 0u32); faces.len() * 3];
+        for c in 0..faces.len() * 3 {
+            let (a, b) = ends(c);
+            let slot = &mut fill[a.min(b) as usize];
+            edges[*slot as usize] = (a.max(b), c as u32);
+            *slot += 1;
+        }
+        for bucket in 0..buckets {
+            edges[start[bucket] as usize..start[bucket + 1] as usize].sort_unstable();
+        }
+        Self { start, edges }
+    }
+
+    /// The half-edges of each edge as (higher vertex, half-edge), ascending.
+    fn iter(&self) -> impl Iterator<Item = &[(u32, u32)]> {
+        self.start.windows(2).flat_map(|w| self.edges[w[0] as usize..w[1] as usize].chunk_by(|x, y| x.0 == y.0))
+    }
 }
 
 /// Proves that faces index existing vertices, edges have at most two opposite faces and vertices have one fan.

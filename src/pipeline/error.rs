@@ -66,6 +66,14 @@ pub enum Error {
         /// What the stage says.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
+    /// A stage refused its input, and there is a picture of what it saw.
+    #[error("{error}; what was seen is in {picture}")]
+    Pictured {
+        /// The refusal.
+        error: Box<Error>,
+        /// The picture in the run folder.
+        picture: std::path::PathBuf,
+    },
 }
 
 impl Error {
@@ -77,6 +85,7 @@ impl Error {
             Self::InputChanged { .. } => Kind::BadInput,
             Self::RunFolder(error) => error.kind(),
             Self::Stage { kind, .. } => *kind,
+            Self::Pictured { error, .. } => error.kind(),
         }
     }
 
@@ -149,7 +158,9 @@ impl StageError for mesh::Error {
 impl StageError for mesh::reconstruct::Error {
     fn kind(&self) -> Kind {
         match self {
-            mesh::reconstruct::Error::Setting { .. } => Kind::Usage,
+            mesh::reconstruct::Error::Setting { .. }
+            | mesh::reconstruct::Error::NothingToDecimate
+            | mesh::reconstruct::Error::CannotClose { .. } => Kind::Usage,
             _ => Kind::BadInput,
         }
     }

@@ -10,6 +10,7 @@ pub mod limits;
 mod line;
 mod page;
 mod picture;
+mod plan_view;
 mod plots;
 pub mod preflight;
 mod profile;

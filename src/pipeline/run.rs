@@ -7,6 +7,7 @@ use super::judge::Previous;
 use super::limits::Status;
 use super::line::{self, Line, Observer, Plan, Stage, done, section};
 use super::picture;
+use super::plan_view::plan_view;
 use super::preflight::Need;
 use super::profile::{self, Columns};
 use super::report;
@@ -18,7 +19,7 @@ use crate::cloud::{Cloud, ScanFrame};
 use crate::io::ply::{PlyMesh, write_mesh};
 use crate::linework::{self, FlattenSettings};
 use crate::mesh::anchor;
-use crate::mesh::{self, FaceId, Mesh};
+use crate::mesh::{self, Mesh};
 use crate::normals::{self, OrientedCloud, Viewpoints};
 use crate::numeric::{Vec2, Vec3};
 use crate::segment::{self, Class, Floor, Quality, SectionField, Segmentation, VertexQuality};
@@ -297,7 +298,7 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
     let cleaned = line.passing("clean", |_| done("clean", clean::clean(&*cloud.get()?, &pipeline.clean)));
     let axis = line.product("axis", |staging| {
         let frame = cloud.get()?.frame().clone();
-        let result = find_axis(pipeline, cleaned.get()?.positions(), &frame)?;
+        let result = find_axis(pipeline, cleaned.get()?.positions(), &frame, line.folder().path())?;
         write_text("axis", &staging.join("axis.csv"), &axis_csv(&result.0, &frame))?;
         Ok(result)
     });
@@ -319,7 +320,8 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         let points = surface_points(&*cloud.get()?, &*cleaned.get()?, &*oriented.get()?, &segmentation);
         oriented.release();
         cleaned.release();
-        let (mesh, summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
+        let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
+        tell_ends(&mut summary, cloud.get()?.frame());
         let quality = points.quality.at(&segmentation.section, &axis, mesh.vertices());
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None, Some(&quality))?;
         let feet = feet(&segmentation);
@@ -423,27 +425,34 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
     });
     let axis = line.product("axis", |staging| {
         let raw = raw.get()?;
-        let result = find_axis(pipeline, &raw.vertices, &raw.frame)?;
+        // Vertices are where a modeller needed them; an axis wants the surface evenly covered.
+        let points = mesh::sample_faces(&raw.vertices, &raw.faces);
+        let result = find_axis(pipeline, &points, &raw.frame, line.folder().path())?;
         write_text("axis", &staging.join("axis.csv"), &axis_csv(&result.0, &raw.frame))?;
         Ok(result)
     });
     let surface = line.product("mesh", |staging| {
         let (raw, axis) = (raw.get()?, axis.get()?);
-        let observed = raw.observed.clone().unwrap_or_else(|| vec![true; raw.faces.len()]);
-        let mesh = Mesh::new(raw.vertices.clone(), raw.faces.clone(), observed).map_err(Error::in_stage("mesh"))?;
         let axis: &Axis = &axis;
-        let coordinates: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
-        let section = SectionField::estimate(&coordinates, 0.0)
-            .map_err(|error| Error::in_stage("mesh")(segment::Error::from(error)))?;
+        let (mesh, mut summary, section) = if mesh::is_in_pieces(&raw.vertices, &raw.faces) {
+            // No piece is the tunnel: the surface is made anew from points on all of them.
+            let points = mesh::sample_faces(&raw.vertices, &raw.faces);
+            let (segmentation, _) =
+                segment::classify(&points, |_| None, axis, &pipeline.segment).map_err(Error::in_stage("mesh"))?;
+            let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, axis, &pipeline.mesh))?;
+            summary["made_from"] = json!(format!("{} points on the pieces of the mesh", points.len()));
+            (mesh, summary, segmentation.section)
+        } else {
+            let observed = raw.observed.clone().unwrap_or_else(|| vec![true; raw.faces.len()]);
+            let taken = mesh::take_over(&raw.vertices, &raw.faces, &observed, axis, &pipeline.mesh);
+            let (mesh, summary) = done("mesh", taken)?;
+            let coordinates: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
+            let section = SectionField::estimate(&coordinates, 0.0)
+                .map_err(|error| Error::in_stage("mesh")(segment::Error::from(error)))?;
+            (mesh, summary, section)
+        };
         write_ply("mesh", &staging.join("mesh.ply"), &raw.frame, &mesh, None, None)?;
-        let filled_m2: f64 = (0..mesh.faces().len())
-            .filter(|&f| !mesh.observed()[f])
-            .map(|f| mesh.double_area_vector(f as FaceId).norm() / 2.0)
-            .sum();
-        let summary = json!({
-            "method": "given", "reason": "the input is a mesh", "vertices": mesh.vertices().len(),
-            "faces": mesh.faces().len(), "area_m2": mesh.area(), "filled_percent": 100.0 * filled_m2 / mesh.area(),
-        });
+        tell_ends(&mut summary, &raw.frame);
         Ok((Surface { mesh, section, feet: vec![], floor: None, points: None }, summary))
     });
     let strip = line.passing("cut", |_| open_surface(pipeline, &*surface.get()?, &*axis.get()?));
@@ -534,15 +543,54 @@ fn surface_points(
 }
 
 /// Traces the axis, or reads the alignment that the settings name.
-fn find_axis(pipeline: &Pipeline, points: &[Vec3], frame: &ScanFrame) -> Result<(Axis, serde_json::Value), Error> {
+fn find_axis(
+    pipeline: &Pipeline,
+    points: &[Vec3],
+    frame: &ScanFrame,
+    out: &Path,
+) -> Result<(Axis, serde_json::Value), Error> {
     let settings = pipeline.axis.in_local(frame);
+    let picture = out.join(REFUSED_PICTURE);
+    // What an earlier, refused run left must not be taken for this one's.
+    match std::fs::remove_file(&picture) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            return Err(cannot_write("axis", &picture)(error));
+        }
+        _ => {}
+    }
     match &settings.alignment {
         Some(path) => {
             let text = std::fs::read_to_string(path)
                 .map_err(|source| Error::in_stage("axis")(io::Error::Read { path: path.clone(), source }))?;
             done("axis", axis::import_csv(&text, frame, &settings))
         }
-        None => done("axis", axis::trace(points, &settings)),
+        None => {
+            let traced = axis::trace(points, &settings);
+            let no_tunnel = matches!(traced, Err(axis::Error::NotATunnel { .. } | axis::Error::ClosedLoop { .. }));
+            let result = done("axis", traced);
+            match (result, no_tunnel.then(|| plan_view(points)).flatten()) {
+                (Err(error), Some(seen)) => {
+                    io::write_picture(&picture, &seen)
+                        .map_err(|error| Error::in_stage("axis")(map::Error::Sink(Box::new(error))))?;
+                    Err(Error::Pictured { error: Box::new(error), picture })
+                }
+                (result, _) => result,
+            }
+        }
+    }
+}
+
+/// A picture of what was seen when the axis is refused, in the run folder.
+const REFUSED_PICTURE: &str = "refused_plan.png";
+
+/// Adds to each side opening the `axis_ends` that make it a run of its own: its `ends_in_local` in scan coordinates.
+fn tell_ends(summary: &mut serde_json::Value, frame: &ScanFrame) {
+    for opening in summary["openings"].as_array_mut().into_iter().flatten() {
+        let local: Option<[[f64; 3]; 2]> = serde_json::from_value(opening["ends_in_local"].clone()).ok();
+        if let Some(ends) = local {
+            let millimetres = |p: [f64; 3]| p.map(|c| (c * 1000.0).round() / 1000.0);
+            opening["axis_ends"] = json!(ends.map(|p| millimetres(frame.scan_from_local(&p.into()).into())));
+        }
     }
 }
 
