@@ -10,6 +10,7 @@ pub mod spatial;
 
 // What happens to a scan, in order.
 pub mod cloud;
+pub mod register;
 pub mod clean;
 pub mod axis;
 pub mod normals;

@@ -1,14 +1,16 @@
 //! `adit info`: what is in a scan or mesh file, and what is suspicious about it.
 
+use super::read_rate::{self, ReadRate};
 use super::{Console, Exit, Failure, Result};
 use crate::io::{self, ErrorKind, ScanInfo};
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
   adit info drift.laz
-  adit info --json station.e57 | jq .stations";
+  adit info --json station.e57 | jq .stations
+  adit info --rate drift.laz            how fast it is read";
 
 /// Arguments of `adit info`.
 #[derive(clap::Args)]
@@ -20,6 +22,9 @@ pub struct Arguments {
     /// Print one JSON object for each file instead of text.
     #[arg(long)]
     json: bool,
+    /// Also read the file as `adit run` does, all columns and guards, and tell how fast that was.
+    #[arg(long)]
+    rate: bool,
 }
 
 /// Reads every file and prints what is in it; ends with the code of the first file that cannot be read.
@@ -27,12 +32,20 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let settings = io::Settings::default();
     let mut first_failure = None;
     for file in &arguments.files {
-        match io::inspect(file, &settings) {
-            Ok(info) if arguments.json => {
-                let text = serde_json::to_string_pretty(&info).map_err(|e| Failure::new(Exit::Internal, e))?;
-                console.print(&text);
+        match look(file, &settings, arguments.rate) {
+            Ok((info, rate)) if arguments.json => {
+                let mut value = serde_json::to_value(&info).map_err(|e| Failure::new(Exit::Internal, e))?;
+                if let Some(rate) = rate {
+                    value["reading"] = serde_json::to_value(rate).map_err(|e| Failure::new(Exit::Internal, e))?;
+                }
+                console.print(&serde_json::to_string_pretty(&value).map_err(|e| Failure::new(Exit::Internal, e))?);
             }
-            Ok(info) => console.print(&describe(&info)),
+            Ok((info, rate)) => {
+                console.print(&describe(&info));
+                if let Some(rate) = rate {
+                    console.print(&format!("{:<24}{}", "reading", rate.describe()));
+                }
+            }
             Err(error) => {
                 let failure = failure(error);
                 if first_failure.is_none() {
@@ -44,6 +57,16 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         }
     }
     first_failure.map_or(Ok(Exit::Done), Err)
+}
+
+/// What is in the file, and how fast it is read. The rate comes first, so that its memory is its own.
+fn look(
+    file: &Path,
+    settings: &io::Settings,
+    with_rate: bool,
+) -> std::result::Result<(ScanInfo, Option<ReadRate>), io::Error> {
+    let rate = with_rate.then(|| read_rate::measure(file, settings)).transpose()?;
+    Ok((io::inspect(file, settings)?, rate))
 }
 
 fn failure(error: io::Error) -> Failure {

@@ -17,6 +17,8 @@ mod measure;
 mod nights;
 mod package;
 mod planes;
+mod read_rate;
+mod register;
 mod run;
 mod run_surface;
 mod sheet;
@@ -46,6 +48,8 @@ enum Command {
     Explain(explain::Arguments),
     /// Tell what is in a scan or mesh file, and what is suspicious about it.
     Info(info::Arguments),
+    /// Bring overlapping stations together (fine registration), and tell how well they agree.
+    Register(register::Arguments),
     /// Bring what was painted on the map back to the points of the scan.
     Lift(lift::Arguments),
     /// Turn strokes painted on the map into polylines, on the map and in 3D.
@@ -81,6 +85,7 @@ impl Command {
             Command::CleanRuns(arguments) => nights::clean_runs(arguments, console),
             Command::Explain(arguments) => explain::run(arguments, console),
             Command::Info(arguments) => info::run(arguments, console),
+            Command::Register(arguments) => register::run(arguments, console),
             Command::Lift(arguments) => lift::run(arguments, console),
             Command::Trace(arguments) => trace::run(arguments, console),
             Command::Drape(arguments) => drape::run(arguments, console),

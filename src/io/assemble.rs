@@ -6,7 +6,8 @@ use super::file_scan::{FileScan, Settings};
 use super::guards::{self, PointGuards};
 use super::poses::Poses;
 use super::source_bytes::SourceBytes;
-use super::{e57, las, pcd, ply, text};
+use super::stations::{self, StationOverlap};
+use super::{e57, las, pcd, ply, text, unit_guess};
 use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile, Station};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
@@ -34,6 +35,9 @@ pub struct Summary {
     pub crs: Option<String>,
     /// Scanner positions known from the files.
     pub stations: usize,
+    /// How well stations agree where they overlap.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub overlaps: Vec<StationOverlap>,
     /// What a person should know.
     pub warnings: Vec<Warning>,
 }
@@ -76,11 +80,18 @@ pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summ
     for path in files {
         let origin = whole.as_ref().map(|w| w.scan.origin);
         let mut scan = match poses.of(path) {
-            None => read_file(path, settings, origin)?,
+            None => {
+                if let Some(poses) = &settings.poses {
+                    let text =
+                        format!("'{}' names no pose for '{}'; it is left where it is", poses.display(), path.display());
+                    warnings.push(Warning::new("no-pose", text));
+                }
+                read_file(path, settings, origin)?
+            }
             Some(pose) => pose.apply(path, read_file(path, settings, None)?, origin),
         };
         refuse_degrees(path, &scan, settings)?;
-        let (guards, mut found) = guards::inspect(&scan);
+        let (guards, mut found, sample) = guards::inspect(&scan);
         found.splice(0..0, std::mem::take(&mut scan.warnings));
         for mut warning in found {
             if files.len() > 1 {
@@ -89,7 +100,7 @@ pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summ
             warnings.push(warning);
         }
         match &mut whole {
-            None => whole = Some(Whole::first(path, scan, guards)),
+            None => whole = Some(Whole::first(path, scan, guards, sample)),
             Some(whole) => whole.append(path, scan, guards, &mut warnings)?,
         }
     }
@@ -134,7 +145,7 @@ pub(super) fn contained<T>(path: &Path, read: impl FnOnce() -> Result<T, Error>)
     })
 }
 
-fn refuse_degrees(path: &Path, scan: &FileScan, settings: &Settings) -> Result<(), Error> {
+pub(super) fn refuse_degrees(path: &Path, scan: &FileScan, settings: &Settings) -> Result<(), Error> {
     let Some(crs) = scan.info.crs.as_ref().filter(|c| c.degrees && settings.unit.is_none()) else { return Ok(()) };
     let name: String = crs.text.chars().take(60).collect();
     Err(Error::bad(
@@ -151,15 +162,18 @@ struct Whole {
     files: Vec<FileSummary>,
     low: Vec3,
     high: Vec3,
+    /// Some points of the first file, scan coordinates.
+    sample: Vec<Vec3>,
 }
 
 impl Whole {
-    fn first(path: &Path, scan: FileScan, guards: PointGuards) -> Self {
+    fn first(path: &Path, scan: FileScan, guards: PointGuards, sample: Vec<Vec3>) -> Self {
         let mut whole = Self {
             sources: Vec::new(),
             files: Vec::new(),
             low: Vec3::repeat(f64::INFINITY),
             high: Vec3::repeat(f64::NEG_INFINITY),
+            sample,
             scan,
         };
         let (points, dropped, info) =
@@ -231,7 +245,7 @@ impl Whole {
     }
 
     fn finish(self, settings: &Settings, mut warnings: Vec<Warning>) -> Result<(Cloud, Summary), Error> {
-        let Self { mut scan, sources, files, low, high } = self;
+        let Self { mut scan, sources, files, low, high, sample } = self;
         let path = &files[0].path;
         if scan.positions.is_empty() {
             let dropped: usize = files.iter().map(|f| f.dropped).sum();
@@ -247,26 +261,28 @@ impl Whole {
             scan.positions.iter_mut().for_each(|p| *p *= metres_per_unit);
             scan.stations.iter_mut().for_each(|s| s.position_in_local *= metres_per_unit);
         } else if settings.unit.is_none() {
-            guess_unit(&(high - low), &mut warnings);
+            warnings.extend(unit_guess::of(&(high - low), &sample));
         }
         settle_attributes(&mut scan.attributes, &mut warnings);
         let crs = scan.info.crs.map(|c| c.text);
         let frame = ScanFrame { origin_in_scan: scan.origin, metres_per_unit, crs: crs.clone() };
-        let stations: Vec<Station> = scan.stations;
-        let summary = Summary {
+        let known: Vec<Station> = scan.stations;
+        let mut summary = Summary {
             points: scan.positions.len(),
             attributes: names(&scan.attributes),
             metres_per_unit,
             origin_in_scan: scan.origin.into(),
             bounds_in_scan: [low.into(), high.into()],
             crs,
-            stations: stations.len(),
+            stations: known.len(),
+            overlaps: Vec::new(),
             files,
             warnings,
         };
         let path = summary.files[0].path.clone();
-        let cloud = Cloud::new(frame, scan.positions, scan.attributes, sources, stations)
+        let cloud = Cloud::new(frame, scan.positions, scan.attributes, sources, known)
             .map_err(|e| Error::bad(&path, e.to_string(), super::error::COPY_AGAIN))?;
+        summary.overlaps = stations::overlaps(&cloud, &mut summary.warnings);
         Ok((cloud, summary))
     }
 }
@@ -362,20 +378,11 @@ fn unit_of(scan: &FileScan, settings: &Settings, warnings: &mut Vec<Warning>) ->
     stated
 }
 
-/// Tunnels are 1 m to 100 km long; other extents point to another unit.
-pub(super) fn guess_unit(extent: &Vec3, warnings: &mut Vec<Warning>) {
-    let longest = extent.amax();
-    let shortest = extent.amin();
-    if longest > 2000.0 && shortest > 500.0 {
-        warnings.push(Warning::new(
-            "unit-guess",
-            format!(
-                "the scan measures {:.0} x {:.0} x {:.0} units: if these are millimetres, \
-                 set ingest.unit = \"millimetre\"",
-                extent.x, extent.y, extent.z
-            ),
-        ));
-    }
+pub(super) fn eight_bit_colors(largest: u16) -> Warning {
+    Warning::new(
+        "eight-bit-colors",
+        format!("colours reach only {largest} of 65535: they are 8-bit values and are scaled by 257"),
+    )
 }
 
 /// All-zero colours and intensities are no measurement; 8-bit colours in 16-bit fields are scaled.
@@ -386,10 +393,7 @@ fn settle_attributes(attributes: &mut Attributes, warnings: &mut Vec<Warning>) {
             warnings.push(Warning::new("no-colors", "all colours are zero and are treated as absent"));
             attributes.colors = None;
         } else if largest <= 255 {
-            warnings.push(Warning::new(
-                "eight-bit-colors",
-                format!("colours reach only {largest} of 65535: they are 8-bit values and are scaled by 257"),
-            ));
+            warnings.push(eight_bit_colors(largest));
             colors.iter_mut().flatten().for_each(|c| *c *= 257);
         }
     }

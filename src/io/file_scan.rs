@@ -68,10 +68,6 @@ pub struct AttributeInfo {
 }
 
 impl AttributeInfo {
-    pub(super) fn up_to(name: &str, max: impl Into<f64>) -> Self {
-        Self { name: name.to_owned(), min: None, max: Some(max.into()) }
-    }
-
     pub(super) fn present(name: &str) -> Self {
         Self { name: name.to_owned(), min: None, max: None }
     }

@@ -1,11 +1,11 @@
 //! What is suspicious about coordinates, whatever the format.
 
-use super::file_scan::FileScan;
+use super::file_scan::{FileInfo, FileScan};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
 use rayon::prelude::*;
 use serde::Serialize;
-use std::collections::HashMap;
+use std::collections::HashSet;
 
 /// Counts of suspicious points of a file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -21,72 +21,108 @@ pub struct PointGuards {
 /// Points in a block of the parallel pass; fixed, so that sums do not depend on the threads.
 const BLOCK: usize = 1 << 16;
 /// Duplicates are counted among about this many points.
-const DUPLICATE_SAMPLE: usize = 1 << 18;
+const DUPLICATE_SAMPLE: u64 = 1 << 18;
 /// A step of 32-bit coordinates that matters, in scan units of about a metre.
 const COARSE_STEP: f64 = 0.0005;
 
-/// Looks at all points of a file. `frame_unit` is the length of a scan unit in metres.
-pub(super) fn inspect(scan: &FileScan) -> (PointGuards, Vec<Warning>) {
-    let mut guards = PointGuards::default();
-    let mut warnings = Vec::new();
-    let n = scan.positions.len();
-    if n == 0 {
-        return (guards, warnings);
+/// Points kept for a closer look when all have come by.
+const SAMPLE: usize = 20_000;
+
+/// Looks at all points of a file that is in memory; also returns an even sample in scan coordinates.
+pub(super) fn inspect(scan: &FileScan) -> (PointGuards, Vec<Warning>, Vec<Vec3>) {
+    let mut pass = GuardsPass::new(scan.positions.len() as u64, scan.origin);
+    pass.add(&scan.positions);
+    pass.finish(&scan.info)
+}
+
+/// Looks at the points of a file while they come by; memory does not grow with their number.
+pub(super) struct GuardsPass {
+    origin: Vec3,
+    at_zero: u64,
+    /// One of 2^shift hashes is kept: all copies of a point are kept or left together, so the share is unbiased.
+    shift: u32,
+    hashes: HashSet<u64>,
+    hashed: u64,
+    stride: usize,
+    points: usize,
+    sample: Vec<Vec3>,
+}
+
+impl GuardsPass {
+    /// For about `n` points relative to `origin`.
+    pub(super) fn new(n: u64, origin: Vec3) -> Self {
+        let shift = (n / DUPLICATE_SAMPLE).checked_ilog2().map_or(0, |l| l + 1);
+        let stride = n.div_ceil(SAMPLE as u64).max(1) as usize;
+        Self { origin, at_zero: 0, shift, hashes: HashSet::new(), hashed: 0, stride, points: 0, sample: Vec::new() }
     }
-    let zero = -scan.origin;
-    // One of 2^shift hashes is kept: all copies of a point are kept or left together, so the share is unbiased.
-    let shift = (n / DUPLICATE_SAMPLE).checked_ilog2().map_or(0, |l| l + 1);
-    let mask = (1u64 << shift) - 1;
-    let found: Vec<(u64, Vec<u64>)> = scan
-        .positions
-        .par_chunks(BLOCK)
-        .map(|block| {
-            let mut at_zero = 0;
-            let mut sample = Vec::new();
-            for p in block {
-                at_zero += u64::from(*p == zero);
-                let hash = hash(p);
-                if hash & mask == 0 {
-                    sample.push(hash);
+
+    pub(super) fn add(&mut self, positions: &[Vec3]) {
+        let zero = -self.origin;
+        let mask = (1u64 << self.shift) - 1;
+        let found: Vec<(u64, Vec<u64>)> = positions
+            .par_chunks(BLOCK)
+            .map(|block| {
+                let mut at_zero = 0;
+                let mut kept = Vec::new();
+                for p in block {
+                    at_zero += u64::from(*p == zero);
+                    let hash = hash(p);
+                    if hash & mask == 0 {
+                        kept.push(hash);
+                    }
                 }
-            }
-            (at_zero, sample)
-        })
-        .collect();
-    guards.at_zero = found.iter().map(|f| f.0).sum();
-    let mut seen: HashMap<u64, ()> = HashMap::with_capacity(DUPLICATE_SAMPLE * 2);
-    let mut sampled = 0u64;
-    for hash in found.iter().flat_map(|f| &f.1) {
-        sampled += 1;
-        seen.insert(*hash, ());
+                (at_zero, kept)
+            })
+            .collect();
+        for (at_zero, kept) in found {
+            self.at_zero += at_zero;
+            self.hashed += kept.len() as u64;
+            self.hashes.extend(kept);
+        }
+        let first = (self.stride - self.points % self.stride) % self.stride;
+        self.sample.extend(positions.iter().skip(first).step_by(self.stride).map(|p| p + self.origin));
+        self.points += positions.len();
     }
-    guards.duplicates = (sampled - seen.len() as u64) << shift;
-    guards.single_precision_loss = lost_to_single_precision(scan);
-    if guards.at_zero > 0 {
-        warnings.push(Warning::new(
-            "points-at-zero",
-            format!("{} of {n} points lie at exactly 0, 0, 0 (scanners write that for lost echoes)", guards.at_zero),
-        ));
+
+    /// What was found, and the sample in scan coordinates.
+    pub(super) fn finish(self, info: &FileInfo) -> (PointGuards, Vec<Warning>, Vec<Vec3>) {
+        let n = self.points;
+        let guards = PointGuards {
+            at_zero: self.at_zero,
+            duplicates: (self.hashed - self.hashes.len() as u64) << self.shift,
+            single_precision_loss: lost_to_single_precision(info, &self.sample),
+        };
+        let mut warnings = Vec::new();
+        if guards.at_zero > 0 {
+            warnings.push(Warning::new(
+                "points-at-zero",
+                format!(
+                    "{} of {n} points lie at exactly 0, 0, 0 (scanners write that for lost echoes)",
+                    guards.at_zero
+                ),
+            ));
+        }
+        if guards.duplicates > 0 {
+            let about = if self.shift == 0 { "" } else { "about " };
+            warnings.push(Warning::new(
+                "duplicate-points",
+                format!("{about}{} of {n} points repeat the coordinates of another point", guards.duplicates),
+            ));
+        }
+        if guards.single_precision_loss {
+            let largest = info.bounds.map_or(0.0, |b| b.iter().flatten().fold(0.0f64, |m, c| m.max(c.abs())));
+            warnings.push(Warning::new(
+                "single-precision-coordinates",
+                format!(
+                    "coordinates up to {largest:.0} were stored as 32-bit floats, which step by {} there: the scan \
+                     lost detail before it came here; export it again with 64-bit or integer coordinates, or with a \
+                     local origin",
+                    single_step(largest)
+                ),
+            ));
+        }
+        (guards, warnings, self.sample)
     }
-    if guards.duplicates > 0 {
-        let about = if shift == 0 { "" } else { "about " };
-        warnings.push(Warning::new(
-            "duplicate-points",
-            format!("{about}{} of {n} points repeat the coordinates of another point", guards.duplicates),
-        ));
-    }
-    if guards.single_precision_loss {
-        let largest = scan.info.bounds.map_or(0.0, |b| b.iter().flatten().fold(0.0f64, |m, c| m.max(c.abs())));
-        warnings.push(Warning::new(
-            "single-precision-coordinates",
-            format!(
-                "coordinates up to {largest:.0} were stored as 32-bit floats, which step by {} there: the scan lost \
-                 detail before it came here; export it again with 64-bit or integer coordinates, or with a local origin",
-                single_step(largest)
-            ),
-        ));
-    }
-    (guards, warnings)
 }
 
 /// A hash of the exact coordinates (splitmix64 finaliser over the three bit patterns).
@@ -107,30 +143,27 @@ fn single_step(value: f64) -> f64 {
     f64::from(f32::from_bits(single.to_bits() + 1)) - f64::from(single)
 }
 
-/// Whether far coordinates all lie on 32-bit floats although the file could say more.
-fn lost_to_single_precision(scan: &FileScan) -> bool {
-    /// Enough points to make an accident impossible.
-    const SAMPLE: usize = 2000;
-    let Some(bounds) = scan.info.bounds else { return false };
-    let stride = scan.positions.len().div_ceil(SAMPLE).max(1);
+/// Whether far coordinates all lie on 32-bit floats although the file could say more; `sample` in scan coordinates.
+fn lost_to_single_precision(info: &FileInfo, sample: &[Vec3]) -> bool {
+    let Some(bounds) = info.bounds else { return false };
     (0..3).any(|axis| {
         let nearest = bounds[0][axis].abs().min(bounds[1][axis].abs());
         if bounds[0][axis].signum() != bounds[1][axis].signum() {
             return false;
         }
         let step = single_step(nearest);
-        if scan.info.single_precision {
+        if info.single_precision {
             return single_step(bounds[0][axis].abs().max(bounds[1][axis].abs())) >= COARSE_STEP;
         }
         // On an integer grid, the 32-bit steps must be much coarser than the grid to be told from it.
-        if step < COARSE_STEP || step < 8.0 * scan.info.resolution {
+        if step < COARSE_STEP || step < 8.0 * info.resolution {
             return false;
         }
-        let tolerance = 0.51 * scan.info.resolution + nearest * 1e-15;
-        let mut values = scan.positions.iter().step_by(stride).map(|p| p[axis] + scan.origin[axis]);
+        let tolerance = 0.51 * info.resolution + nearest * 1e-15;
         let spread = bounds[1][axis] - bounds[0][axis];
-        scan.positions.len() >= 100
+        // Enough points to make an accident impossible.
+        sample.len() >= 100
             && spread > 8.0 * step
-            && values.all(|v| (f64::from(v as f32) - v).abs() <= tolerance)
+            && sample.iter().all(|p| (f64::from(p[axis] as f32) - p[axis]).abs() <= tolerance)
     })
 }

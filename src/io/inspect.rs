@@ -1,16 +1,16 @@
 //! What is in a file, for `adit info`: everything that reading would tell, without building a cloud.
 
-use super::assemble::{contained, read_file};
+use super::assemble::contained;
 use super::detect::{self, Format};
 use super::error::{Error, ErrorKind};
 use super::file_scan::{AttributeInfo, FileScan, Settings};
-use super::guards::{self, PointGuards};
+use super::guards::{GuardsPass, PointGuards};
+use super::neighbourhood::NeighbourhoodPass;
 use super::source_bytes::SourceBytes;
-use super::{mesh_scan, ply};
+use super::stream::{Pass, Scope, Start, stream_file};
+use super::{mesh_scan, ply, unit_guess};
 use crate::numeric::Vec3;
-use crate::numeric::statistics;
 use crate::warning::Warning;
-use rayon::prelude::*;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -81,8 +81,9 @@ pub fn inspect(path: &Path, settings: &Settings) -> Result<ScanInfo, Error> {
     let mut info = if format.is_mesh() {
         mesh_info(path, bytes)?
     } else {
-        match read_file(path, &lenient, None) {
-            Ok(scan) => scan_info(path, bytes, scan, settings),
+        let mut look = Look::default();
+        match stream_file(path, &lenient, Scope { ranges: true, window: None }, &mut look) {
+            Ok((scan, points)) => scan_info(path, bytes, scan, points, look, settings),
             Err(error) if format == Format::Ply => without_coordinates(path, bytes, error)?,
             Err(error) => return Err(error),
         }
@@ -97,10 +98,43 @@ pub fn inspect(path: &Path, settings: &Settings) -> Result<ScanInfo, Error> {
     Ok(info)
 }
 
-fn scan_info(path: &Path, bytes: u64, mut scan: FileScan, settings: &Settings) -> ScanInfo {
-    let (guards, found) = guards::inspect(&scan);
+/// What is looked at while the points come by.
+#[derive(Default)]
+struct Look {
+    begun: Option<(GuardsPass, NeighbourhoodPass)>,
+}
+
+impl Pass for Look {
+    fn begin(&mut self, start: Start) {
+        self.begun = Some((GuardsPass::new(start.records, start.origin), NeighbourhoodPass::new(start.seeds)));
+    }
+
+    fn add(&mut self, positions: &[Vec3]) {
+        if let Some((guards, neighbourhood)) = &mut self.begun {
+            guards.add(positions);
+            neighbourhood.add(positions);
+        }
+    }
+}
+
+fn scan_info(path: &Path, bytes: u64, mut scan: FileScan, points: u64, look: Look, settings: &Settings) -> ScanInfo {
     let mut warnings = std::mem::take(&mut scan.warnings);
-    warnings.extend(found);
+    let (mut guards, mut sample) = (PointGuards::default(), Vec::new());
+    let (mut spacing, mut density) = (None, None);
+    if let Some((guards_pass, neighbourhood)) = look.begun {
+        let (found, new, points) = guards_pass.finish(&scan.info);
+        (guards, sample) = (found, points);
+        warnings.extend(new);
+        (spacing, density) = neighbourhood.spacing_and_density();
+    }
+    let largest_color = |a: &AttributeInfo| ["red", "green", "blue"].contains(&&a.name[..]).then_some(a.max).flatten();
+    let sixteen_bit_fields = ["LAS", "LAZ", "COPC"].contains(&scan.info.format);
+    if let Some(largest) = scan.info.attributes.iter().filter_map(largest_color).reduce(f64::max)
+        && sixteen_bit_fields
+        && (1.0..=255.0).contains(&largest)
+    {
+        warnings.push(super::assemble::eight_bit_colors(largest as u16));
+    }
     let stated = scan.info.crs.as_ref().and_then(|c| c.metres_per_unit);
     let metres_per_unit = settings.unit.map(super::Unit::metres).or(stated).unwrap_or(1.0);
     let degrees = settings.unit.is_none() && scan.info.crs.as_ref().is_some_and(|c| c.degrees);
@@ -110,23 +144,22 @@ fn scan_info(path: &Path, bytes: u64, mut scan: FileScan, settings: &Settings) -
             "the coordinates are degrees, not lengths: reproject the scan to a metric system before `adit run`",
         ));
     }
-    if scan.positions.is_empty() {
+    if points == 0 {
         warnings.push(Warning::new("no-points", "there are no points to map"));
     }
     if let (Some([low, high]), None, None) = (scan.info.bounds, settings.unit, stated)
         && !degrees
     {
-        super::assemble::guess_unit(&(Vec3::from(high) - Vec3::from(low)), &mut warnings);
+        warnings.extend(unit_guess::of(&(Vec3::from(high) - Vec3::from(low)), &sample));
     }
-    let (spacing, density) = spacing_and_density(&scan.positions);
     let truncated = !settings.allow_truncated && warnings.iter().any(|w| w.code == "truncated");
-    let usable = !scan.positions.is_empty() && !degrees && !truncated;
+    let usable = points > 0 && !degrees && !truncated;
     ScanInfo {
         file: path.to_owned(),
         bytes,
         format: scan.info.format,
         version: scan.info.version,
-        points: scan.positions.len() as u64,
+        points,
         records: scan.record_count,
         faces: scan.info.faces,
         bounds: scan.info.bounds,
@@ -213,43 +246,4 @@ fn without_coordinates(path: &Path, bytes: u64, error: Error) -> Result<ScanInfo
         usable: false,
         warnings: vec![Warning::new("no-coordinates", error.to_string())],
     })
-}
-
-/// Sampled points whose neighbourhood is looked at.
-const SEEDS: usize = 48;
-
-/// Median nearest-neighbour distance and surface density, in file units, around evenly chosen points.
-///
-/// The density counts points in the disc that holds the 32 nearest neighbours: count / (pi r^2).
-fn spacing_and_density(positions: &[Vec3]) -> (Option<f64>, Option<f64>) {
-    const NEIGHBOURS: usize = 32;
-    if positions.len() < 2 {
-        return (None, None);
-    }
-    let seeds = SEEDS.min(positions.len());
-    let found: Vec<(Option<f64>, Option<f64>)> = (0..seeds)
-        .into_par_iter()
-        .map(|k| {
-            let seed = positions[k * positions.len() / seeds];
-            let mut nearest: Vec<f64> = Vec::with_capacity(NEIGHBOURS + 1);
-            let mut limit = f64::INFINITY;
-            for p in positions {
-                let d = (p - seed).norm_squared();
-                if d > 0.0 && d < limit {
-                    let at = nearest.partition_point(|&n| n < d);
-                    nearest.insert(at, d);
-                    nearest.truncate(NEIGHBOURS);
-                    if nearest.len() == NEIGHBOURS {
-                        limit = nearest[NEIGHBOURS - 1];
-                    }
-                }
-            }
-            let density = (nearest.len() == NEIGHBOURS)
-                .then(|| NEIGHBOURS as f64 / (std::f64::consts::PI * nearest[NEIGHBOURS - 1]));
-            (nearest.first().map(|d| d.sqrt()), density)
-        })
-        .collect();
-    let mut distances: Vec<f64> = found.iter().filter_map(|f| f.0).collect();
-    let mut densities: Vec<f64> = found.iter().filter_map(|f| f.1).collect();
-    (statistics::median(&mut distances), statistics::median(&mut densities))
 }

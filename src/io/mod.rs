@@ -17,6 +17,7 @@ mod inspect;
 mod label_column;
 mod las;
 mod map_folder;
+mod neighbourhood;
 pub mod ply;
 mod mesh_formats;
 mod mesh_scan;
@@ -34,6 +35,9 @@ mod source_bytes;
 pub mod vector;
 mod scan_date;
 mod tile_pyramid;
+mod stations;
+mod stream;
+mod unit_guess;
 pub mod world_file;
 mod text;
 mod write;
@@ -48,7 +52,10 @@ pub use map_folder::{LabelsFile, MapFolder, write_picture};
 pub use mesh_scan::{MeshSummary, RawMesh, read_mesh};
 pub use package_file::{PackageError, PackageFile};
 pub use placed_points::{PlacedPoint, placed_points};
+pub use poses::{Pose, write_poses};
 pub use scan_date::las_creation_date;
+pub use stations::{StationOverlap, StationScan, read_station};
+pub use stream::{ScanBox, stream_positions};
 pub use write::{NO_CLASS, PointColumns, WriteSummary, write_cloud, write_cloud_in_steps, write_points};
 
 #[cfg(test)]

@@ -65,6 +65,14 @@ impl Roles {
     }
 }
 
+/// Says how many records gave no point.
+pub(super) fn dropped(count: u64, of: u64, first: u64, reason: &str) -> Warning {
+    Warning::new(
+        "dropped-points",
+        format!("{count} of {of} points have {reason} and are dropped (the first is record {first})"),
+    )
+}
+
 /// Columns being filled.
 #[derive(Debug)]
 pub(super) struct PointTable {
@@ -207,14 +215,7 @@ impl PointTable {
         if !dropped.is_empty() {
             let keep: Vec<bool> = self.positions.iter().map(finite).collect();
             self.retain(&keep);
-            warnings.push(Warning::new(
-                "dropped-points",
-                format!(
-                    "{} of {record_count} points have {reason} and are dropped (the first is record {})",
-                    dropped.len(),
-                    dropped[0]
-                ),
-            ));
+            warnings.push(self::dropped(dropped.len() as u64, record_count, dropped[0], reason));
         }
         if self.bad_labels > 0 {
             warnings.push(label_column::bad_values(self.bad_labels, &roles.label));
@@ -250,7 +251,50 @@ impl PointTable {
     }
 }
 
+/// Rows in memory that can be walked column by column.
+pub(super) trait ColumnSource {
+    /// Calls `put` with the number of each row and its value in a column.
+    fn each(&self, column: usize, put: impl FnMut(usize, f64));
+}
+
 impl TableSlots<'_> {
+    /// Fills all rows column by column; the same as [`TableSlots::set`] for each row, but each column in a loop of its own.
+    pub(super) fn set_columns(&mut self, roles: &Roles, bad_labels: &mut u64, source: &impl ColumnSource) {
+        let rows = self.len();
+        for (axis, &column) in roles.position.iter().enumerate() {
+            let slots = &mut self.positions[..rows];
+            source.each(column, |row, value| slots[row][axis] = value);
+        }
+        if let Some((columns, range)) = roles.color {
+            for (channel, column) in columns.into_iter().enumerate() {
+                if let Some(slots) = &mut self.colors {
+                    let scale = if range == ColorRange::EightBit { 257.0 } else { 1.0 };
+                    source.each(column, |row, value| slots[row][channel] = (value * scale) as u16);
+                } else if let Some(slots) = &mut self.open_colors {
+                    source.each(column, |row, value| slots[row][channel] = value as f32);
+                }
+            }
+        }
+        if let (Some(column), Some(slots)) = (roles.intensity, &mut self.intensities) {
+            source.each(column, |row, value| slots[row] = value as f32);
+        }
+        if let (Some(column), Some(slots)) = (roles.classification, &mut self.classifications) {
+            source.each(column, |row, value| slots[row] = value as u8);
+        }
+        if let (Some(column), Some(slots)) = (roles.source_id, &mut self.source_ids) {
+            source.each(column, |row, value| slots[row] = value as u16);
+        }
+        if let Some(slots) = &mut self.labels {
+            let column = match &roles.label {
+                LabelSource::Column { index, .. } => Some(*index),
+                _ => roles.classification,
+            };
+            if let Some(column) = column {
+                source.each(column, |row, value| slots[row] = label_column::label_of(value, bad_labels));
+            }
+        }
+    }
+
     pub(super) fn len(&self) -> usize {
         self.positions.len()
     }

@@ -22,9 +22,11 @@ pub(super) struct Poses {
 
 /// A rigid motion from the coordinates of a file to those of the scan.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Pose {
-    rotation: Mat3,
-    translation: Vec3,
+pub struct Pose {
+    /// A rotation matrix.
+    pub rotation: Mat3,
+    /// Added after the rotation, scan units.
+    pub translation: Vec3,
 }
 
 #[derive(Deserialize)]
@@ -79,18 +81,52 @@ impl Poses {
         Ok(poses)
     }
 
-    /// The pose of a file, by its path or else its name.
+    /// The pose of a file, by its path, or by the end of its path that the entry names.
     pub(super) fn of(&self, path: &Path) -> Option<Pose> {
         let exact = self.scans.iter().find(|(file, _)| file == path);
-        let named = || self.scans.iter().find(|(file, _)| file.components().count() == 1 && path.ends_with(file));
+        let named = || self.scans.iter().find(|(file, _)| file.is_relative() && path.ends_with(file));
         exact.or_else(named).map(|s| s.1)
     }
 }
 
+/// Writes poses as `ingest.poses` reads them; each has a remark, which becomes a comment.
+///
+/// # Errors
+/// [`Error::Write`] when the operating system refuses. The file appears whole or not at all.
+pub fn write_poses(path: &Path, scans: &[(PathBuf, Pose, String)]) -> Result<(), Error> {
+    let mut text = String::from("# Poses by `adit register`, for ingest.poses: scan = pose * (x, y, z, 1).\n");
+    for (file, pose, remark) in scans {
+        for line in remark.lines() {
+            text += &format!("\n# {line}");
+        }
+        let name = toml::Value::String(file.display().to_string());
+        text += &format!("\n[[scan]]\nfile = {name}\npose = [\n");
+        for r in 0..3 {
+            let m = |c| pose.rotation[(r, c)];
+            text += &format!("  [{:?}, {:?}, {:?}, {:?}],\n", m(0), m(1), m(2), pose.translation[r]);
+        }
+        text += "  [0.0, 0.0, 0.0, 1.0],\n]\n";
+    }
+    let unfinished = path.with_extension("toml.part");
+    std::fs::write(&unfinished, text)
+        .and_then(|()| std::fs::rename(&unfinished, path))
+        .map_err(|e| Error::write(path, e))
+}
+
 impl Pose {
+    /// The pose of a file that is in scan coordinates already.
+    pub(super) fn identity() -> Self {
+        Self { rotation: Mat3::identity(), translation: Vec3::zeros() }
+    }
+
+    /// Scan coordinates of a point of the file.
+    pub(super) fn apply_to(&self, point: &Vec3) -> Vec3 {
+        self.rotation * point + self.translation
+    }
+
     /// Moves a scan that was read without an origin; a file without stations gets one where its own origin goes.
     pub(super) fn apply(&self, path: &Path, mut scan: FileScan, origin: Option<Vec3>) -> FileScan {
-        let moved = |p: Vec3| self.rotation * p + self.translation;
+        let moved = |p: Vec3| self.apply_to(&p);
         let from = scan.origin;
         for p in &mut scan.positions {
             *p = moved(*p + from);

@@ -438,7 +438,7 @@ fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) 
             // No piece is the tunnel: the surface is made anew from points on all of them.
             let points = mesh::sample_faces(&raw.vertices, &raw.faces);
             let (segmentation, _) =
-                segment::classify(&points, |_| None, axis, &pipeline.segment).map_err(Error::in_stage("mesh"))?;
+                segment::classify_positions(&points, axis, &pipeline.segment).map_err(Error::in_stage("mesh"))?;
             let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, axis, &pipeline.mesh))?;
             summary["made_from"] = json!(format!("{} points on the pieces of the mesh", points.len()));
             (mesh, summary, segmentation.section)

@@ -239,6 +239,14 @@ impl Container {
         Ok(())
     }
 
+    /// Changes the offset of the coordinates, here and in the stored header.
+    pub(super) fn set_offset(&mut self, offset: [f64; 3]) {
+        self.offset = offset;
+        for (axis, value) in offset.iter().enumerate() {
+            self.raw[155 + 8 * axis..163 + 8 * axis].copy_from_slice(&value.to_le_bytes());
+        }
+    }
+
     /// The first variable length record (extended ones last) with this identity.
     pub(super) fn vlr(&self, user_id: &str, record_id: u16) -> Option<&Vlr> {
         self.vlrs.iter().chain(&self.evlrs).find(|v| v.is(user_id, record_id))

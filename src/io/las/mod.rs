@@ -11,10 +11,22 @@
 
 mod crs;
 mod extra_bytes;
+mod copc;
 mod header;
+mod ranges;
 mod read;
 mod records;
 mod rewrite;
+mod stream;
 
 pub(super) use read::{announced_points, read};
 pub(super) use rewrite::{rewrite, write_new};
+pub(super) use stream::stream;
+
+/// First byte of each chunk of a file.
+#[cfg(test)]
+pub(super) fn chunk_starts(path: &std::path::Path) -> Vec<u64> {
+    let source = super::source_bytes::SourceBytes::open(path).expect("a file");
+    let opened = read::Opened::new(&source, &super::Settings::default(), None).expect("a sound file");
+    opened.records.chunks.iter().map(records::Chunk::begins_at).collect()
+}

@@ -1,7 +1,7 @@
 //! Records into columns.
 
 use super::super::error::{COPY_AGAIN, Error};
-use super::super::file_scan::{AttributeInfo, FileInfo, FileScan, Settings};
+use super::super::file_scan::{FileInfo, FileScan, Settings};
 use super::super::label_column::{self, LabelSource};
 use super::super::source_bytes::SourceBytes;
 use super::extra_bytes::{self, ExtraField};
@@ -31,53 +31,90 @@ pub(in super::super) fn read(
     settings: &Settings,
     origin: Option<Vec3>,
 ) -> Result<FileScan, Error> {
-    let container = Container::read(source)?;
-    let mut warnings = container.warnings.clone();
-    let records = Records::plan(source, &container, settings.allow_truncated, &mut warnings)?;
-    let (fields, _) = extra_fields(&container);
-    let label = label_source(source, settings, &fields)?;
-    let layout = Layout::of(container.format);
-    let origin = match origin {
-        Some(origin) => origin,
-        None => choose_origin(&container, &records)?,
-    };
-    let mut columns = Columns::allocate(source, &records, &layout, &label)?;
-    let label_field = match &label {
-        LabelSource::Column { index, .. } => Some(&fields[*index]),
-        _ => None,
-    };
-    let decoder = Decoder { container: &container, layout, label: &label, label_field, origin };
-    let facts = decoder.decode(&records, &mut columns)?;
-    check_bounding_box(&container, &facts, &mut warnings);
-    let mut info = info(&container, &records, &fields);
-    info.crs = super::crs::of(&container);
-    info.attributes.extend(facts.attributes(&layout, &container, &fields));
-    if facts.records > 0 {
-        let corner = |x: [i32; 3]| [0, 1, 2].map(|i| f64::from(x[i]) * container.scale[i] + container.offset[i]);
-        info.bounds = Some([corner(facts.min), corner(facts.max)]);
+    let opened = Opened::new(source, settings, origin)?;
+    let mut columns = Columns::allocate(source, &opened.records, &opened.layout, &opened.label)?;
+    let facts = opened.decoder().decode(&opened.records, &mut columns)?;
+    let mut scan = opened.scan(&facts);
+    scan.attributes = columns.attributes(&facts);
+    scan.positions = bytemuck::cast_vec(columns.positions);
+    Ok(scan)
+}
+
+/// A file whose header is understood and whose records are found.
+pub(super) struct Opened<'a> {
+    pub(super) container: Container,
+    pub(super) records: Records<'a>,
+    pub(super) fields: Vec<ExtraField>,
+    pub(super) layout: Layout,
+    pub(super) origin: Vec3,
+    label: LabelSource,
+    warnings: Vec<Warning>,
+}
+
+impl<'a> Opened<'a> {
+    pub(super) fn new(source: &'a SourceBytes, settings: &Settings, origin: Option<Vec3>) -> Result<Self, Error> {
+        let container = Container::read(source)?;
+        let mut warnings = container.warnings.clone();
+        let records = Records::plan(source, &container, settings.allow_truncated, &mut warnings)?;
+        let (fields, _) = extra_fields(&container);
+        let label = label_source(source, settings, &fields)?;
+        let layout = Layout::of(container.format);
+        let origin = match origin {
+            Some(origin) => origin,
+            None => choose_origin(&container, &records)?,
+        };
+        Ok(Self { container, records, fields, layout, origin, label, warnings })
     }
-    info.resolution = container.scale.iter().map(|s| s.abs()).fold(0.0, f64::max);
-    if facts.bad_labels > 0 {
-        warnings.push(label_column::bad_values(facts.bad_labels, &label));
+
+    pub(super) fn decoder(&self) -> Decoder<'_> {
+        let label_field = match &self.label {
+            LabelSource::Column { index, .. } => Some(&self.fields[*index]),
+            _ => None,
+        };
+        Decoder {
+            container: &self.container,
+            layout: self.layout,
+            label: &self.label,
+            label_field,
+            origin: self.origin,
+        }
     }
-    info.label_column = label.name();
-    if facts.records > 0 && layout.rgb.is_some() && facts.color_max == 0 {
-        warnings.push(Warning::new("no-colors", "all colours are zero and are treated as absent"));
+
+    /// What is known about the file after its records were seen, without columns.
+    pub(super) fn scan(&self, facts: &Facts) -> FileScan {
+        let (container, records) = (&self.container, &self.records);
+        let mut warnings = self.warnings.clone();
+        check_bounding_box(container, facts, &mut warnings);
+        let mut info = info(container, records, &self.fields);
+        info.crs = super::crs::of(container);
+        if facts.records > 0 {
+            let corner = |x: [i32; 3]| [0, 1, 2].map(|i| f64::from(x[i]) * container.scale[i] + container.offset[i]);
+            let (a, b) = (corner(facts.min), corner(facts.max));
+            // A negative scale swaps the ends.
+            info.bounds = Some([[0, 1, 2].map(|i| a[i].min(b[i])), [0, 1, 2].map(|i| a[i].max(b[i]))]);
+        }
+        info.resolution = container.scale.iter().map(|s| s.abs()).fold(0.0, f64::max);
+        if facts.bad_labels > 0 {
+            warnings.push(label_column::bad_values(facts.bad_labels, &self.label));
+        }
+        info.label_column = self.label.name();
+        if facts.records > 0 && self.layout.rgb.is_some() && facts.color_max == 0 {
+            warnings.push(Warning::new("no-colors", "all colours are zero and are treated as absent"));
+        }
+        if facts.records > 0 && facts.intensity_max == 0 {
+            warnings.push(Warning::new("no-intensities", "all intensities are zero and are treated as absent"));
+        }
+        FileScan {
+            origin: self.origin,
+            positions: Vec::new(),
+            attributes: Attributes::default(),
+            stations: Vec::new(),
+            record_count: records.count,
+            dropped_records: Vec::new(),
+            info,
+            warnings,
+        }
     }
-    if facts.records > 0 && facts.intensity_max == 0 {
-        warnings.push(Warning::new("no-intensities", "all intensities are zero and are treated as absent"));
-    }
-    let attributes = columns.attributes(&facts);
-    Ok(FileScan {
-        origin,
-        positions: bytemuck::cast_vec(columns.positions),
-        attributes,
-        stations: Vec::new(),
-        record_count: records.count,
-        dropped_records: Vec::new(),
-        info,
-        warnings,
-    })
 }
 
 fn info(container: &Container, records: &Records, fields: &[ExtraField]) -> FileInfo {
@@ -220,19 +257,19 @@ struct Slots<'a> {
 
 /// What was seen in the records besides their values.
 #[derive(Clone, Copy, Debug)]
-struct Facts {
-    records: u64,
-    min: [i32; 3],
-    max: [i32; 3],
-    color_max: u16,
-    intensity_max: u16,
+pub(super) struct Facts {
+    pub(super) records: u64,
+    pub(super) min: [i32; 3],
+    pub(super) max: [i32; 3],
+    pub(super) color_max: u16,
+    pub(super) intensity_max: u16,
     class_max: u8,
     source_max: u16,
-    bad_labels: u64,
+    pub(super) bad_labels: u64,
 }
 
 impl Facts {
-    const NONE: Self = Self {
+    pub(super) const NONE: Self = Self {
         records: 0,
         min: [i32::MAX; 3],
         max: [i32::MIN; 3],
@@ -243,7 +280,7 @@ impl Facts {
         bad_labels: 0,
     };
 
-    fn merge(mut self, other: Self) -> Self {
+    pub(super) fn merge(mut self, other: Self) -> Self {
         self.records += other.records;
         for axis in 0..3 {
             self.min[axis] = self.min[axis].min(other.min[axis]);
@@ -256,25 +293,9 @@ impl Facts {
         self.bad_labels += other.bad_labels;
         self
     }
-
-    fn attributes(&self, layout: &Layout, container: &Container, fields: &[ExtraField]) -> Vec<AttributeInfo> {
-        let mut all = vec![
-            AttributeInfo::up_to("intensity", self.intensity_max),
-            AttributeInfo::up_to("classification", self.class_max),
-            AttributeInfo::up_to("point_source_id", self.source_max),
-        ];
-        if layout.rgb.is_some() {
-            all.push(AttributeInfo::up_to("color", self.color_max));
-        }
-        if ![0, 2].contains(&container.format) {
-            all.push(AttributeInfo::present("gps_time"));
-        }
-        all.extend(fields.iter().map(|f| AttributeInfo::present(&f.name())));
-        all
-    }
 }
 
-struct Decoder<'a> {
+pub(super) struct Decoder<'a> {
     container: &'a Container,
     layout: Layout,
     label: &'a LabelSource,
@@ -311,15 +332,14 @@ impl Decoder<'_> {
         if matches!(self.label, LabelSource::Column { .. }) { selection.decompress_extra_bytes() } else { selection }
     }
 
-    fn decode_piece(&self, bytes: &[u8], at: usize, slots: &mut Slots, facts: &mut Facts) {
-        let (layout, container) = (&self.layout, self.container);
-        let n = bytes.len() / container.record_len;
-        let records = || bytes.chunks_exact(container.record_len);
+    /// Positions of whole records, relative to the origin.
+    pub(super) fn decode_positions(&self, bytes: &[u8], positions: &mut [[f64; 3]], facts: &mut Facts) {
+        let container = self.container;
         let scale = container.scale;
         let shift = [0, 1, 2].map(|i| container.offset[i] - self.origin[i]);
-        facts.records += n as u64;
+        facts.records += positions.len() as u64;
         let (mut low, mut high) = (facts.min, facts.max);
-        for (record, position) in records().zip(&mut slots.positions[at..at + n]) {
+        for (record, position) in bytes.chunks_exact(container.record_len).zip(positions) {
             let head: &[u8; 12] = record[..12].try_into().expect("records have at least 20 bytes");
             for axis in 0..3 {
                 let b = axis * 4;
@@ -330,6 +350,23 @@ impl Decoder<'_> {
             }
         }
         (facts.min, facts.max) = (low, high);
+    }
+
+    /// Counts the values of the label column that are no labels.
+    pub(super) fn count_bad_labels(&self, bytes: &[u8], facts: &mut Facts) {
+        let Some(field) = self.label_field else { return };
+        for record in bytes.chunks_exact(self.container.record_len) {
+            if let Some(value) = field.value(&record[self.layout.standard..]) {
+                label_column::label_of(value, &mut facts.bad_labels);
+            }
+        }
+    }
+
+    fn decode_piece(&self, bytes: &[u8], at: usize, slots: &mut Slots, facts: &mut Facts) {
+        let (layout, container) = (&self.layout, self.container);
+        let n = bytes.len() / container.record_len;
+        let records = || bytes.chunks_exact(container.record_len);
+        self.decode_positions(bytes, &mut slots.positions[at..at + n], facts);
         for (record, intensity) in records().zip(&mut slots.intensities[at..at + n]) {
             *intensity = u16::from_le_bytes([record[12], record[13]]);
             facts.intensity_max = facts.intensity_max.max(*intensity);

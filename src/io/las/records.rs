@@ -51,6 +51,11 @@ pub(super) struct Chunk {
 }
 
 impl Chunk {
+    /// First byte in the file.
+    pub(super) fn begins_at(&self) -> u64 {
+        self.at
+    }
+
     /// Only the first record of the chunk.
     pub(super) fn head(self) -> Self {
         Self { count: self.count.min(1), ..self }

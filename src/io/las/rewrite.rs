@@ -8,6 +8,7 @@ use super::header::{Container, EVLR_HEADER, VLR_HEADER, Vlr};
 use super::read::extra_fields;
 use super::records::{Chunk, Layout, Records};
 use crate::cloud::{Cloud, SourceFile};
+use crate::numeric::Vec3;
 use crate::warning::Warning;
 use laz::{DecompressionSelection, LazVlr, LazVlrBuilder, ParLasZipCompressor};
 use rayon::prelude::*;
@@ -132,6 +133,25 @@ impl<'a> Source<'a> {
         Ok(Self { file, bytes, container, kept, fields, replaced })
     }
 
+    /// Whether the cloud has the points elsewhere than the file says: a pose was applied when they were read.
+    fn is_placed(&self, cloud: &Cloud) -> Result<bool, Error> {
+        let records = self.records()?;
+        let (container, points) = (&self.container, PointOfRecord::new(self.file));
+        let mut placed = false;
+        if let Some(first) = records.chunks.first() {
+            records.visit(&first.head(), DecompressionSelection::all(), &mut |record, bytes| {
+                let Some(point) = points.get(record) else { return };
+                let here = cloud.frame().scan_from_local(&cloud.positions()[point]);
+                placed = (0..3).any(|axis| {
+                    let raw = i32::from_le_bytes(bytes[4 * axis..4 * axis + 4].try_into().expect("four bytes"));
+                    let there = f64::from(raw) * container.scale[axis] + container.offset[axis];
+                    (here[axis] - there).abs() > 0.01 * container.scale[axis].abs()
+                });
+            })?;
+        }
+        Ok(placed)
+    }
+
     fn records(&self) -> Result<Records<'_>, Error> {
         let records = Records::plan(&self.bytes, &self.container, true, &mut Vec::new())?;
         if records.count != self.file.record_count {
@@ -182,6 +202,18 @@ impl Requantize {
         }
         true
     }
+}
+
+/// Writes a position into the coordinates at the head of a record; `false` when one does not fit into 32 bits.
+fn put_position(container: &Container, position_in_scan: &Vec3, record: &mut [u8]) -> bool {
+    for axis in 0..3 {
+        let raw = ((position_in_scan[axis] - container.offset[axis]) / container.scale[axis]).round();
+        if raw.abs() > f64::from(i32::MAX) {
+            return false;
+        }
+        record[4 * axis..4 * axis + 4].copy_from_slice(&(raw as i32).to_le_bytes());
+    }
+    true
 }
 
 /// Counts and ranges for the header of the output.
@@ -240,17 +272,29 @@ pub(in super::super) fn rewrite(
     fields.extend(appended_fields(columns));
     let kept: usize = first.kept.iter().map(|r| r.len()).sum();
     let layout = Layout::of(first.container.format);
-    let mut output = Output::create(
-        destination,
-        &first.container,
-        &fields,
-        layout.standard + kept + appended_len(columns),
-        &mut summary,
-    )?;
+    let placed: Vec<bool> = sources.iter().map(|s| s.is_placed(cloud)).collect::<Result<_, _>>()?;
+    let mut template = first.container.clone();
+    let moved = placed.contains(&true);
+    if moved {
+        // Scanner coordinates have an offset near the scanner; where the poses put the points, it may be out of reach.
+        template.set_offset(cloud.frame().origin_in_scan.into());
+    }
+    let mut output =
+        Output::create(destination, &template, &fields, layout.standard + kept + appended_len(columns), &mut summary)?;
     let record_len = output.record_len;
-    for source in &sources {
+    for (source, placed) in sources.iter().zip(placed) {
         let records = source.records()?;
-        let requantize = Requantize::between(&source.container, &first.container);
+        let requantize = Requantize::between(&source.container, &template);
+        if placed {
+            summary.warnings.push(Warning::new(
+                "placed-points",
+                format!(
+                    "coordinates of '{}' are written where its pose puts them, in steps of {:?}",
+                    source.file.path.display(),
+                    template.scale
+                ),
+            ));
+        }
         let points = PointOfRecord::new(source.file);
         let encode = |chunk: &Chunk| -> Result<(Vec<u8>, Tally), Error> {
             let mut out = Vec::with_capacity(chunk.count as usize * record_len);
@@ -260,13 +304,22 @@ pub(in super::super) fn rewrite(
                 for (i, record) in bytes.chunks_exact(source.container.record_len).enumerate() {
                     let start = out.len();
                     out.extend_from_slice(&record[..layout.standard]);
-                    if !requantize.apply(&mut out[start..]) {
+                    let point = points.get(first_record + i as u64);
+                    let fits = match point.filter(|_| placed) {
+                        Some(p) => put_position(
+                            &template,
+                            &cloud.frame().scan_from_local(&cloud.positions()[p]),
+                            &mut out[start..],
+                        ),
+                        None => requantize.apply(&mut out[start..]),
+                    };
+                    if !fits {
                         overflow.get_or_insert(first_record + i as u64);
                     }
                     for range in &source.kept {
                         out.extend_from_slice(&record[range.clone()]);
                     }
-                    append_columns(columns, points.get(first_record + i as u64), &mut out);
+                    append_columns(columns, point, &mut out);
                     tally.add(&out[start..], layout.return_mask);
                 }
             })?;
@@ -291,7 +344,13 @@ pub(in super::super) fn rewrite(
             }
         }
     }
-    output.finish(Some(&first.bytes), &mut summary)?;
+    let mut finished = WriteSummary::default();
+    output.finish(Some(&first.bytes), &mut finished)?;
+    summary.points = finished.points;
+    if sources.len() == 1 && !moved {
+        // Otherwise counts and ranges must differ from those of the first source.
+        summary.warnings.extend(finished.warnings);
+    }
     Ok(summary)
 }
 

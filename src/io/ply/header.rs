@@ -49,6 +49,41 @@ impl Scalar {
         matches!(self, Self::F32 | Self::F64)
     }
 
+    /// The numbers at byte `at` of records of `stride` bytes, one loop for each type.
+    #[inline(always)]
+    pub(super) fn column(
+        self,
+        records: &[u8],
+        stride: usize,
+        at: usize,
+        big_endian: bool,
+        mut put: impl FnMut(usize, f64),
+    ) {
+        macro_rules! numbers {
+            ($type:ty) => {
+                for (row, record) in records.chunks_exact(stride).enumerate() {
+                    let raw = record[at..at + size_of::<$type>()].try_into().expect("the slice has this length");
+                    put(
+                        row,
+                        (if big_endian { <$type>::from_be_bytes(raw) } else { <$type>::from_le_bytes(raw) }) as f64,
+                    );
+                }
+            };
+        }
+        match self {
+            Self::I8 => numbers!(i8),
+            Self::U8 => numbers!(u8),
+            Self::I16 => numbers!(i16),
+            Self::U16 => numbers!(u16),
+            Self::I32 => numbers!(i32),
+            Self::U32 => numbers!(u32),
+            Self::I64 => numbers!(i64),
+            Self::U64 => numbers!(u64),
+            Self::F32 => numbers!(f32),
+            Self::F64 => numbers!(f64),
+        }
+    }
+
     /// The number at the start of `bytes`, which hold at least [`Scalar::size`].
     #[inline(always)]
     pub(super) fn get(self, bytes: &[u8], big_endian: bool) -> f64 {

@@ -12,6 +12,7 @@ mod mesh;
 mod placed_points;
 mod read;
 mod rewrite;
+mod stream;
 
 pub(super) use header::announced_vertices;
 pub(super) use mesh::read_mesh;
@@ -19,3 +20,4 @@ pub use mesh::{PlyMesh, RawMesh, read_chart, write_mesh};
 pub(super) use placed_points::placed_points;
 pub(super) use read::{describe, read};
 pub(super) use rewrite::{rewrite, write_new};
+pub(super) use stream::stream;

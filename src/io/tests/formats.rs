@@ -265,3 +265,58 @@ fn poses_from_a_file() {
     assert!(error.to_string().contains("mirrors"), "{error}");
     assert_eq!(error.kind(), ErrorKind::Settings);
 }
+
+/// A rough tunnel along x as seen by one station, about itself.
+fn station(seed: u32, place: impl Fn(Vec3) -> Vec3) -> String {
+    let random = |i: u32| {
+        let mut h = u64::from(i).wrapping_add(u64::from(seed) << 33).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        h = (h ^ (h >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        (h >> 12) as f64 / (1u64 << 52) as f64
+    };
+    (0..30_000u32)
+        .map(|i| {
+            let (x, a) = (random(3 * i) * 10.0, random(3 * i + 1) * std::f64::consts::TAU);
+            let waves = (x * 1.7 + (2.0 * a).sin()).sin() + (x * 3.1).cos() * (3.0 * a).sin();
+            let r = 2.5 + 0.08 * waves;
+            let p = place(Vec3::new(x, r * a.cos(), r * a.sin()));
+            format!("{:.5} {:.5} {:.5}\n", p.x, p.y, p.z)
+        })
+        .collect()
+}
+
+#[test]
+fn residuals_between_stations_and_points_that_a_pose_moves() {
+    let folder = tempfile::tempdir().unwrap();
+    let far = Vec3::new(600_000.0, 6_000_000.0, 100.0);
+    let texts = [station(1, |p| p), station(2, |p| p + Vec3::new(0.0, 0.0, 0.03))];
+    let mut paths = Vec::new();
+    for (name, text) in ["s1", "s2"].iter().zip(texts) {
+        let (from, to) = (folder.path().join(format!("{name}.xyz")), folder.path().join(format!("{name}.laz")));
+        std::fs::write(&from, text).unwrap();
+        write_cloud(&read(&from).0, None, &to).unwrap();
+        paths.push(to);
+    }
+    let (_, summary) = read_cloud(&paths, &Settings::default()).unwrap();
+    let [pair] = &summary.overlaps[..] else { panic!("{:?}", summary.overlaps) };
+    assert!(pair.overlap.median_m > 0.01, "{pair:?}");
+    assert!(summary.warnings.iter().any(|w| w.code == "station-overlap"));
+
+    // The pose takes the lift of 3 cm back, and both far away.
+    let poses = folder.path().join("poses.toml");
+    let pose = |z| Pose { rotation: crate::numeric::Mat3::identity(), translation: far + Vec3::new(0.0, 0.0, z) };
+    let scans = [("s1.laz", 0.0), ("s2.laz", -0.03)].map(|(f, z)| (PathBuf::from(f), pose(z), "a remark".to_owned()));
+    write_poses(&poses, &scans).unwrap();
+    let settings = Settings { poses: Some(poses), ..Default::default() };
+    let (cloud, summary) = read_cloud(&paths, &settings).unwrap();
+    assert!(summary.overlaps[0].overlap.median_m < 0.005, "{:?}", summary.overlaps);
+    let (labels, [a, b, c]) = columns(cloud.len());
+    let to = folder.path().join("both.laz");
+    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c };
+    let written = write_points(&cloud, &columns, &to).unwrap();
+    assert_eq!(written.warnings.iter().filter(|w| w.code == "placed-points").count(), 2, "{:?}", written.warnings);
+    let (back, _) = read(&to);
+    for (p, q) in cloud.positions().iter().zip(back.positions()) {
+        let (p, q) = (cloud.frame().scan_from_local(p), back.frame().scan_from_local(q));
+        assert!((p - q).amax() < 1e-4, "{p} {q}");
+    }
+}

@@ -164,6 +164,28 @@ fn millimetres_are_guessed_and_can_be_set() {
     assert!(!summary.warnings.iter().any(|w| w.code == "unit-guess"));
 }
 
+/// A tunnel along a rising bend, 5 units wide and high for `scale` 1, as text.
+fn drift(scale: f64) -> String {
+    (0..4000)
+        .map(|i| {
+            let (s, a) = (f64::from(i) * 0.01, f64::from(i) * 2.399_963);
+            let across = (3.0 + 2.5 * a.cos(), 2.5 * a.sin() + s * 0.5);
+            let (x, y) = (s * 2.0, across.0 + s * s * 0.01);
+            format!("{:.4} {:.4} {:.4}\n", x * scale, y * scale, across.1 * scale)
+        })
+        .collect()
+}
+
+#[test]
+fn units_are_guessed_from_the_height_of_the_drift() {
+    assert_eq!(read_named("a.xyz", drift(1.0).as_bytes()).unwrap().warnings, vec![]);
+    for (scale, name) in [(1000.0, "millimetre"), (100.0, "centimetre"), (4.5 / 0.3048, "foot")] {
+        let summary = read_named("a.xyz", drift(scale).as_bytes()).unwrap();
+        let guess = summary.warnings.iter().find(|w| w.code == "unit-guess").unwrap_or_else(|| panic!("{name}"));
+        assert!(guess.message.contains(&format!("ingest.unit = \"{name}\"")), "{guess:?}");
+    }
+}
+
 /// A LAS file that states a coordinate reference system.
 fn las_with_crs(wkt: &str) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();

@@ -2,6 +2,7 @@
 
 mod formats;
 mod guards;
+mod las_variants;
 
 use super::*;
 use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile};

@@ -1,0 +1,83 @@
+//! Read, write, and let an independent reader compare: laspy, where a Python with it is present.
+//!
+//! `ADIT_TEST_PYTHON` names the Python (default `python3`); `ADIT_ROUND_TRIP_FOLDER` adds all LAS and LAZ files of a
+//! folder to those that are made here.
+
+use adit::cloud::Cloud;
+use adit::io::{self, PointColumns};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// The Python with laspy, or why there is none.
+fn python() -> Result<String, String> {
+    let python = std::env::var("ADIT_TEST_PYTHON").unwrap_or_else(|_| "python3".into());
+    match Command::new(&python).args(["-c", "import laspy, lazrs"]).output() {
+        Ok(done) if done.status.success() => Ok(python),
+        Ok(done) => Err(String::from_utf8_lossy(&done.stderr).lines().last().unwrap_or("no laspy").to_owned()),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// All records with the columns that a run appends.
+fn rewrite(cloud: &Cloud, to: &Path) {
+    let n = cloud.len();
+    let labels: Vec<u32> = (0..n).map(|i| (i % 9) as u32).collect();
+    let column = |step: f64| (0..n).map(|i| if i % 7 == 0 { f64::NAN } else { i as f64 * step }).collect::<Vec<f64>>();
+    let (chainage, girth, offset) = (column(0.01), column(-0.001), column(0.0001));
+    let columns = PointColumns { labels: &labels, chainage: &chainage, girth: &girth, offset: &offset };
+    io::write_points(cloud, &columns, to).unwrap();
+}
+
+fn las_files(folder: &Path) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|p| p.extension().is_some_and(|e| e == "las" || e == "laz"))
+        .collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn laspy_finds_every_record_header_and_vlr_again() {
+    let python = match python() {
+        Ok(python) => python,
+        Err(cause) => return eprintln!("SKIPPED: no Python with laspy and lazrs ({cause}); set ADIT_TEST_PYTHON"),
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let text: String =
+        (0..3000).map(|i| format!("{}.5 {} {} {} {} 7 9\n", i % 91, i % 13, i % 7, i % 999, i % 256)).collect();
+    let made = folder.path().join("made.xyz");
+    std::fs::write(&made, text).unwrap();
+    let (cloud, _) = io::read_cloud(&[made], &io::Settings::default()).unwrap();
+    for name in ["made.las", "made.laz"] {
+        io::write_cloud(&cloud, None, &folder.path().join(name)).unwrap();
+    }
+    let mut files = las_files(folder.path());
+    if let Ok(more) = std::env::var("ADIT_ROUND_TRIP_FOLDER") {
+        files.extend(las_files(Path::new(&more)));
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/round_trip_laspy.py");
+    let settings = io::Settings { unit: Some(io::Unit::Metre), ..Default::default() };
+    let (mut failures, mut compared) = (Vec::new(), 0);
+    for file in files {
+        // Files without points make no cloud; that they are refused is tested elsewhere.
+        let Ok((cloud, _)) = io::read_cloud(std::slice::from_ref(&file), &settings) else {
+            eprintln!("not read: {}", file.display());
+            continue;
+        };
+        for extension in ["las", "laz"] {
+            let copy = folder.path().join(format!("copy.{extension}"));
+            rewrite(&cloud, &copy);
+            let done = Command::new(&python).arg(&script).args([&file, &copy]).output().unwrap();
+            compared += 1;
+            if !done.status.success() {
+                let said = String::from_utf8_lossy(if done.stdout.is_empty() { &done.stderr } else { &done.stdout });
+                failures.push(format!("{} as {extension}: {}", file.display(), said.trim()));
+            }
+        }
+    }
+    assert!(compared >= 4, "only {compared} compared");
+    assert!(failures.is_empty(), "{} of {compared}:\n{}", failures.len(), failures.join("\n"));
+    eprintln!("{compared} copies compared by laspy");
+}
