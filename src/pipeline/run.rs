@@ -570,7 +570,7 @@ fn find_axis(
             let result = done("axis", traced);
             match (result, no_tunnel.then(|| plan_view(points)).flatten()) {
                 (Err(error), Some(seen)) => {
-                    io::write_picture(&picture, &seen)
+                    io::write_picture(&picture, &seen, None)
                         .map_err(|error| Error::in_stage("axis")(map::Error::Sink(Box::new(error))))?;
                     Err(Error::Pictured { error: Box::new(error), picture })
                 }

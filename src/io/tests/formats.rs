@@ -311,7 +311,7 @@ fn residuals_between_stations_and_points_that_a_pose_moves() {
     assert!(summary.overlaps[0].overlap.median_m < 0.005, "{:?}", summary.overlaps);
     let (labels, [a, b, c]) = columns(cloud.len());
     let to = folder.path().join("both.laz");
-    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c };
+    let columns = PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c, surface_classes: None };
     let written = write_points(&cloud, &columns, &to).unwrap();
     assert_eq!(written.warnings.iter().filter(|w| w.code == "placed-points").count(), 2, "{:?}", written.warnings);
     let (back, _) = read(&to);
