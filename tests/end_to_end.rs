@@ -49,18 +49,28 @@ fn report(folder: &Path) -> serde_json::Value {
     serde_json::from_str(&fs::read_to_string(folder.join("report.json")).unwrap()).unwrap()
 }
 
-/// The columns label, chainage, girth (metres; NaN for none) of a LAS file that has them as its last extra bytes.
+/// The columns label, chainage, girth (metres; NaN for none) of a LAS file, by their names.
 fn map_columns(file: &Path) -> Vec<(u32, f64, f64)> {
-    let records = las::Reader::from_path(file).unwrap().read_all().unwrap();
+    let mut reader = las::Reader::from_path(file).unwrap();
+    let described =
+        reader.header().vlrs().iter().find(|v| v.user_id == "LASF_Spec" && v.record_id == 4).unwrap().clone();
+    let mut at = 0;
+    let mut place = std::collections::BTreeMap::new();
+    for descriptor in described.data.chunks_exact(192) {
+        let name = String::from_utf8_lossy(&descriptor[4..36]).trim_end_matches('\0').to_owned();
+        place.insert(name, at);
+        at += [0, 1, 1, 2, 2, 4, 4, 8, 8, 4, 8][usize::from(descriptor[2])];
+    }
+    let records = reader.read_all().unwrap();
     let metres = |raw: i64, none: i64| if raw == none { f64::NAN } else { raw as f64 * 1e-6 };
     records
         .points()
         .map(|p| {
             let bytes = p.unwrap().extra_bytes;
-            let own = &bytes[bytes.len() - 20..];
-            let label = u32::from_le_bytes(own[0..4].try_into().unwrap());
-            let chainage = i64::from_le_bytes(own[4..12].try_into().unwrap());
-            let girth = i32::from_le_bytes(own[12..16].try_into().unwrap());
+            let of = |name: &str| &bytes[place[name]..];
+            let label = u32::from_le_bytes(of("label")[..4].try_into().unwrap());
+            let chainage = i64::from_le_bytes(of("chainage")[..8].try_into().unwrap());
+            let girth = i32::from_le_bytes(of("girth")[..4].try_into().unwrap());
             (label, metres(chainage, i64::MIN), metres(i64::from(girth), i64::from(i32::MIN)))
         })
         .collect()

@@ -22,8 +22,9 @@ const BIN_M: f64 = 0.25;
 const BRIDGED_BINS: usize = 8;
 /// Distance between the sections whose lines are looked for, metres.
 const STEP_M: f64 = 1.0;
-/// Sections on both sides whose median smooths an angle.
-const MEDIAN_REACH: usize = 3;
+/// Sections on both sides whose median radii make the section that a springline is looked for in: rough rock has its
+/// widest place anywhere, the drive it was blasted for does not.
+const MEDIAN_REACH: usize = 12;
 /// Missing half-widths from which the springline follows, as shares of the greatest.
 const MISSING: [f64; 2] = [0.01, 0.04];
 /// Angles at which the half-width is looked at.
@@ -95,28 +96,38 @@ pub fn reference_lines(
 fn springlines(section: &SectionField) -> Vec<Feet> {
     let steps = ((section.end() - section.start()) / STEP_M).ceil().max(1.0) as usize;
     let chainage = |i: usize| section.start() + (i as f64 + 0.5) / steps as f64 * (section.end() - section.start());
-    let raw: Vec<[f64; 2]> =
-        (0..steps).map(|i| [-1.0, 1.0].map(|side| spring_angle(section, chainage(i), side))).collect();
+    // Angles from the left side of the invert over the crown to its right side.
+    let radii: Vec<Vec<f64>> =
+        (0..steps).map(|i| (0..=2 * ANGLES).map(|k| section.radius(chainage(i), angle_of(k))).collect()).collect();
     (0..steps)
         .map(|i| {
-            let near = &raw[i.saturating_sub(MEDIAN_REACH)..(i + MEDIAN_REACH + 1).min(steps)];
-            let of = |k: usize| {
-                let mut values: Vec<f64> = near.iter().map(|a| a[k]).collect();
-                statistics::median(&mut values).unwrap_or(raw[i][k])
-            };
-            [chainage(i), of(0), of(1)]
+            let near = &radii[i.saturating_sub(MEDIAN_REACH)..(i + MEDIAN_REACH + 1).min(steps)];
+            let usual: Vec<f64> = (0..=2 * ANGLES)
+                .map(|k| {
+                    let mut values: Vec<f64> = near.iter().map(|r| r[k]).collect();
+                    statistics::median(&mut values).unwrap_or(radii[i][k])
+                })
+                .collect();
+            let angle = |side| spring_angle(section, chainage(i), &usual, side);
+            [chainage(i), angle(-1.0), angle(1.0)]
         })
         .collect()
 }
 
-/// Angle of the springline on one side (`side`: -1 left, 1 right).
-fn spring_angle(section: &SectionField, chainage: f64, side: f64) -> f64 {
-    let angle = |k: usize| side * PI * k as f64 / ANGLES as f64;
-    let width = |k: usize| section.radius(chainage, angle(k)) * (side * angle(k)).sin();
+/// The angle of an entry in a table of radii around the section.
+fn angle_of(k: usize) -> f64 {
+    PI * (k as f64 / ANGLES as f64 - 1.0)
+}
+
+/// Angle of the springline on one side (`side`: -1 left, 1 right) of a section with these radii.
+fn spring_angle(section: &SectionField, chainage: f64, radii: &[f64], side: f64) -> f64 {
+    // From the crown downwards.
+    let entry = |k: usize| if side < 0.0 { ANGLES - k } else { ANGLES + k };
+    let width = |k: usize| radii[entry(k)] * angle_of(entry(k)).sin().abs();
     let widest = (0..=ANGLES).map(width).fold(0.0, f64::max);
     let girth_at = |missing: f64| {
         let k = (0..=ANGLES).find(|&k| width(k) >= (1.0 - missing) * widest).unwrap_or(ANGLES / 2);
-        section.girth(chainage, angle(k))
+        section.girth(chainage, angle_of(entry(k)))
     };
     let [near, far] = MISSING.map(girth_at);
     section.angle_of_girth(chainage, 2.0 * near - far)
@@ -195,9 +206,9 @@ mod tests {
     fn springlines_of_a_horseshoe_and_a_pipe() {
         for radius in [horseshoe as fn(f64) -> f64, |_| 1.3] {
             let section = SectionField::uniform(0.0, 20.0, radius);
-            for side in [-1.0, 1.0] {
-                let angle = spring_angle(&section, 7.0, side).to_degrees();
-                assert!((angle - 90.0 * side).abs() < 3.0, "{angle}");
+            for [_, left, right] in springlines(&section) {
+                assert!((left.to_degrees() + 90.0).abs() < 3.0, "{left}");
+                assert!((right.to_degrees() - 90.0).abs() < 3.0, "{right}");
             }
         }
     }

@@ -13,12 +13,14 @@ mod crs;
 mod extra_bytes;
 mod copc;
 mod header;
+mod placed_points;
 mod ranges;
 mod read;
 mod records;
 mod rewrite;
 mod stream;
 
+pub(super) use placed_points::placed_points;
 pub(super) use read::{announced_points, read};
 pub(super) use rewrite::{rewrite, write_new};
 pub(super) use stream::stream;

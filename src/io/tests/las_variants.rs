@@ -162,7 +162,12 @@ fn write_and_read(made: &Made, folder: &Path) -> (PathBuf, Cloud, Summary) {
 
 fn lift_to(cloud: &Cloud, to: &Path) -> WriteSummary {
     let (labels, [a, b, c]) = columns(cloud.len());
-    write_points(cloud, &PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c, surface_classes: None }, to).unwrap()
+    write_points(
+        cloud,
+        &PointColumns { labels: &labels, chainage: &a, girth: &b, offset: &c, surface_classes: None },
+        to,
+    )
+    .unwrap()
 }
 
 #[test]
