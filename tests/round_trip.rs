@@ -24,7 +24,8 @@ fn rewrite(cloud: &Cloud, to: &Path) {
     let labels: Vec<u32> = (0..n).map(|i| (i % 9) as u32).collect();
     let column = |step: f64| (0..n).map(|i| if i % 7 == 0 { f64::NAN } else { i as f64 * step }).collect::<Vec<f64>>();
     let (chainage, girth, offset) = (column(0.01), column(-0.001), column(0.0001));
-    let columns = PointColumns { labels: &labels, chainage: &chainage, girth: &girth, offset: &offset };
+    let columns =
+        PointColumns { labels: &labels, chainage: &chainage, girth: &girth, offset: &offset, surface_classes: None };
     io::write_points(cloud, &columns, to).unwrap();
 }
 
