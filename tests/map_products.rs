@@ -238,6 +238,15 @@ fn a_package_has_everything_and_the_same_bytes_again() {
     assert!(!names.iter().any(|n| n.contains(".adit") || n == "points.laz"));
 }
 
+/// The values of the first picture of a TIFF file of floats.
+fn places(file: &[u8]) -> Vec<f32> {
+    let mut decoder = tiff::decoder::Decoder::new(std::io::Cursor::new(file)).unwrap();
+    match decoder.read_image().unwrap() {
+        tiff::decoder::DecodingResult::F32(values) => values,
+        _ => panic!("no floats"),
+    }
+}
+
 /// A package of a run without a back-map has one all the same.
 #[test]
 fn the_way_back_is_drawn_for_the_package() {
@@ -256,7 +265,12 @@ fn the_way_back_is_drawn_for_the_package() {
     let mut zip = zip::ZipArchive::new(File::open(path).unwrap()).unwrap();
     let mut drawn = Vec::new();
     zip.by_name("map/xyz.tif").unwrap().read_to_end(&mut drawn).unwrap();
-    assert!(drawn == fs::read(run().join("map/xyz.tif")).unwrap());
+    // From chart.ply the surface comes back to the last bit of its scan coordinates, which is not that of local ones.
+    let (drawn, of_the_run) = (places(&drawn), places(&fs::read(run().join("map/xyz.tif")).unwrap()));
+    assert_eq!(drawn.len(), of_the_run.len());
+    for (a, b) in drawn.iter().zip(&of_the_run) {
+        assert!((a - b).abs() < 1e-5 || (a.is_nan() && b.is_nan()), "{a} {b}");
+    }
     let left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(left.len(), 2, "{left:?}");
 }

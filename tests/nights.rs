@@ -620,6 +620,12 @@ fn disagreements(root: &Value, schema: &Value, value: &Value, at: &str, errors: 
                     errors.push(format!("{at}: {n} items"));
                 }
             }
+            "minProperties" | "maxProperties" => {
+                let (n, m) = (value.as_object().map_or(0, serde_json::Map::len) as u64, wanted.as_u64().unwrap());
+                if value.is_object() && (if rule == "minProperties" { n < m } else { n > m }) {
+                    errors.push(format!("{at}: {n} properties"));
+                }
+            }
             "allOf" => list().iter().for_each(|s| errors.extend(inner(s, value, at))),
             "anyOf" | "oneOf" => {
                 let tried: Vec<Vec<String>> = list().iter().map(|s| inner(s, value, at)).collect();

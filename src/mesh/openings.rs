@@ -3,7 +3,7 @@
 //! On the unrolled grid an opening begins at cells that hold points far behind the wall (class *outside*) and no wall in
 //! front of them; it takes in all cells around that lie behind the wall line by more than [`BEHIND_IN_RADII`], so that
 //! the cheeks and the floor of a side drift go with it. Relief that leads nowhere (a niche, an overbreak) is no opening.
-//! The surface is then cut off at the wall line: the opening stays a hole, or is closed and marked as filled.
+//! The surface is then cut off at the wall line: the opening stays a hole.
 //!
 //! Cost: linear in points and cells.
 
@@ -32,8 +32,6 @@ pub enum SideOpenings {
     /// They stay holes whose rim is the wall line.
     #[default]
     Hole,
-    /// They are closed at the wall line, marked as filled.
-    Close,
     /// Nothing is cut off: what was seen of the side drift stays part of the surface.
     Keep,
 }
@@ -62,7 +60,7 @@ pub(super) fn behind_m(section: &SectionField) -> f64 {
 }
 
 /// What a person should know of the openings.
-pub(super) fn warning(openings: &[SideOpening], what: SideOpenings) -> Warning {
+pub(super) fn warning(openings: &[SideOpening]) -> Warning {
     let list: Vec<String> = openings
         .iter()
         .map(|o| {
@@ -70,11 +68,10 @@ pub(super) fn warning(openings: &[SideOpening], what: SideOpenings) -> Warning {
             format!("{side} at {:.1} m ({:.1} m wide, seen {:.1} m deep)", o.chainage_m, o.width_m[0], o.seen_depth_m)
         })
         .collect();
-    let fate = if what == SideOpenings::Close { "closed there" } else { "left as holes" };
     Warning::new(
         "side-openings",
         format!(
-            "{} side opening(s) were cut off at the wall line and {fate}: {}; mesh.side_openings changes that, and \
+            "{} side opening(s) were cut off at the wall line and left as holes: {}; mesh.side_openings changes that, and \
              axis.ends follows a side drift in a run of its own",
             openings.len(),
             list.join("; ")

@@ -53,7 +53,7 @@ pub struct Settings {
     /// metres; 0 leaves holes. Only the section method knows where the wall goes on.
     pub fill_behind_furniture_m: f64,
     /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim,
-    /// `"close"` closes it there and marks it filled (the section method only), `"keep"` keeps what was seen of it.
+    /// `"keep"` keeps what was seen of it.
     pub side_openings: SideOpenings,
     /// Thins the mesh: `{ faces = N }` down to a number of faces, `{ deviation_m = X }` as far as the surface moves no
     /// more than that. Not thinned when not given.
@@ -123,12 +123,6 @@ pub enum Error {
         /// What is allowed.
         must: &'static str,
     },
-    /// Two settings that do not go together.
-    #[error("mesh.side_openings = \"close\" needs the section method, but {reason}; use \"hole\"")]
-    CannotClose {
-        /// Why the section method is not used.
-        reason: String,
-    },
     /// `decimate` without a limit.
     #[error("mesh.decimate needs `faces` or `deviation_m`: how far to thin")]
     NothingToDecimate,
@@ -182,7 +176,7 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         ));
     }
     if !section.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
-        warnings.push(openings::warning(&section.openings, settings.side_openings));
+        warnings.push(openings::warning(&section.openings));
     }
     let reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
     let (mesh, thinned) = thin(mesh, settings);
@@ -201,9 +195,6 @@ fn by_distance(
     options: &section::Options,
     reason: String,
 ) -> Result<(Mesh, Summary), Error> {
-    if settings.side_openings == SideOpenings::Close {
-        return Err(Error::CannotClose { reason });
-    }
     let mut warnings = Vec::new();
     let count = |class: Class| segmentation.class.iter().filter(|k| **k == class).count();
     let front = count(Class::Furniture);
@@ -249,7 +240,7 @@ fn by_distance(
         surface_under_repair.retain(|[a, b, c]| !line.is_open(&axis.project(&((a + b + c) / 3.0)), segmentation));
         openings = line.openings;
         if !openings.is_empty() {
-            warnings.push(openings::warning(&openings, settings.side_openings));
+            warnings.push(openings::warning(&openings));
         }
     }
     let (mesh, repaired) = finish(surface_under_repair, axis, settings, &mut warnings);
@@ -523,7 +514,5 @@ mod tests {
         let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
         let wrong = Settings { max_gap_m: 0.0, ..Settings::default() };
         assert!(matches!(reconstruct(&segmentation, &axis(), &wrong), Err(Error::Setting { key: "max_gap_m", .. })));
-        let both = Settings { method: Method::Implicit, side_openings: SideOpenings::Close, ..Settings::default() };
-        assert!(matches!(reconstruct(&segmentation, &axis(), &both), Err(Error::CannotClose { .. })));
     }
 }

@@ -493,10 +493,6 @@ fn support(
         .collect();
     // Stretch the metric of profile scans, so that a hole counts by its width around the section.
     let scale = [grid.row_m * around_gap / along_gap, grid.column_m];
-    if options.side_openings == SideOpenings::Close {
-        // Before the narrow gaps are closed, so that none stays along the rim.
-        state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = Node::Filled);
-    }
     if options.fill_hole_m > 0.0 {
         close(grid, &mut state, options.fill_hole_m / 2.0, scale, |_| true);
     }

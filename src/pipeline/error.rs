@@ -158,9 +158,7 @@ impl StageError for mesh::Error {
 impl StageError for mesh::reconstruct::Error {
     fn kind(&self) -> Kind {
         match self {
-            mesh::reconstruct::Error::Setting { .. }
-            | mesh::reconstruct::Error::NothingToDecimate
-            | mesh::reconstruct::Error::CannotClose { .. } => Kind::Usage,
+            mesh::reconstruct::Error::Setting { .. } | mesh::reconstruct::Error::NothingToDecimate => Kind::Usage,
             _ => Kind::BadInput,
         }
     }

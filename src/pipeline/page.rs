@@ -14,7 +14,7 @@ h1{font-size:1.5rem;margin:.5rem 0;overflow-wrap:anywhere}h2{font-size:1.15rem;m
 .verdict{border-radius:.5rem;padding:1rem;color:#fff}.pass{background:#1b7f3b}.warn{background:#8a5a00}.fail{background:#b3261e}.skipped{background:#5f6368}
 .pill{border-radius:1rem;padding:.1rem .6rem;color:#fff;font-size:.85rem;white-space:nowrap}
 table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.3rem .5rem;border-bottom:1px solid var(--line);vertical-align:top}
-.scroll{overflow-x:auto}img,svg{max-width:100%;height:auto;display:block}svg{width:100%}img.long{max-width:none;width:60rem}
+.scroll{overflow-x:auto}.drawing{min-width:42rem}img,svg{max-width:100%;height:auto;display:block}svg{width:100%}img.long{max-width:none;width:60rem}
 figure{margin:.75rem 0}figcaption{font-size:.9rem;opacity:.85}
 .plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,21rem),1fr));gap:0 1.5rem}
 .sections{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(46%,10rem),1fr));gap:0 1rem}
@@ -114,7 +114,12 @@ fn figure(html: &mut String, folder: &Path, name: &str, caption: &str) {
 fn drawing(html: &mut String, folder: &Path, name: &str, caption: &str) {
     if let Ok(svg) = std::fs::read_to_string(folder.join(name)) {
         let svg = svg.replace(" xmlns=\"http://www.w3.org/2000/svg\"", "");
-        let _ = writeln!(html, "<figure>{}<figcaption>{}</figcaption></figure>", svg.trim_end(), escape(caption));
+        let _ = writeln!(
+            html,
+            "<figure><div class=\"scroll\"><div class=\"drawing\">{}</div></div><figcaption>{}</figcaption></figure>",
+            svg.trim_end(),
+            escape(caption)
+        );
     }
 }
 
