@@ -414,7 +414,7 @@ mod tests {
             {"type":"Feature","properties":{"id":7},"geometry":{"type":"LineString","coordinates":[[1,2],[3,4.5]]}},
             {"type":"Feature","properties":{},"geometry":{"type":"MultiLineString","coordinates":[[[1,2],[3,4]],[[5,6],[7,8]]]}}]}"#;
         fs::write(&path, text).unwrap();
-        let traces = read_traces(&[path.clone()]).unwrap();
+        let traces = read_traces(std::slice::from_ref(&path)).unwrap();
         assert_eq!(traces.iter().map(|t| t.id.as_str()).collect::<Vec<_>>(), ["7", "2", "2"]);
         assert_eq!(traces[0].points, [[1.0, 2.0], [3.0, 4.5]]);
         fs::write(&path, r#"{"features":[{"geometry":{"type":"Point","coordinates":[1,2]}}]}"#).unwrap();

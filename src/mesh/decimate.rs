@@ -88,7 +88,7 @@ pub fn decimate(mesh: Mesh, target: &Decimate) -> (Mesh, Summary) {
     let limit = target.deviation_m.map_or(f64::INFINITY, |d| d * d);
     let stop = target.faces.unwrap_or(0);
     let locked_vertices = work.locked.iter().filter(|l| **l).count();
-    let mut queue: BinaryHeap<Reverse<(u64, VertexId, VertexId, u32, u32)>> = BinaryHeap::new();
+    let mut queue = Queue::new();
     for f in 0..work.faces.len() {
         let corners = work.faces[f];
         for i in 0..3 {
@@ -127,6 +127,9 @@ pub fn decimate(mesh: Mesh, target: &Decimate) -> (Mesh, Summary) {
     let summary = Summary { faces_before, faces_after: faces.len(), deviation_m: worst.sqrt(), locked_vertices };
     (Mesh::new(vertices, faces, observed).expect("the link condition keeps a manifold"), summary)
 }
+
+/// Edges by their cost (its bits): the two ends, and their states when the cost was told.
+type Queue = BinaryHeap<Reverse<(u64, VertexId, VertexId, u32, u32)>>;
 
 /// The mesh while it shrinks. Removed faces have corners `VertexId::MAX`.
 struct Work {
@@ -172,7 +175,7 @@ impl Work {
         }
     }
 
-    fn offer(&self, queue: &mut BinaryHeap<Reverse<(u64, VertexId, VertexId, u32, u32)>>, a: VertexId, b: VertexId) {
+    fn offer(&self, queue: &mut Queue, a: VertexId, b: VertexId) {
         if self.locked[a as usize] && self.locked[b as usize] {
             return;
         }

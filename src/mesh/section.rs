@@ -142,7 +142,7 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
             furniture[p.row as usize * grid.columns + (p.column as usize).min(grid.columns - 1)] = true;
         }
     }
-    let state = support(&grid, &clusters, &places, &furniture, &open, along_gap, options, &mut summary);
+    let state = support(&grid, &clusters, &places, [&furniture, &open], along_gap, options, &mut summary);
     fill_depths(&grid, &state, &mut places);
     // Between profiles whole rows have no points of their own; elsewhere a face needs a measured corner.
     let profiles = segmentation.sampling.is_profiles();
@@ -449,13 +449,12 @@ fn plane_at_origin(samples: &[[f64; 4]]) -> [f64; 3] {
     }
 }
 
-/// Which nodes belong to the surface, and why.
+/// Which nodes belong to the surface, and why. The flags tell which cells hold furniture, and which a side opening.
 fn support(
     grid: &Grid,
     clusters: &[Cluster],
     places: &[GridPoint],
-    furniture: &[bool],
-    open: &[bool],
+    [furniture, open]: [&[bool]; 2],
     along_gap: f64,
     options: &Options,
     summary: &mut Summary,

@@ -174,10 +174,10 @@ fn limits(html: &mut String, report: &Value, folder: &Path) {
     html.push_str("</table></div>\n");
     let skipped: Vec<&Value> = checks(report).filter(|c| !is_effort(c) && !is_judged(c)).collect();
     if !skipped.is_empty() {
-        let _ = write!(
+        let _ = writeln!(
             html,
             "<details><summary>{} limits were not judged: no level is set, or there was nothing to measure</summary>\
-             <div class=\"scroll\"><table>\n",
+             <div class=\"scroll\"><table>",
             skipped.len()
         );
         skipped.into_iter().for_each(|check| limit_row(html, check));
@@ -232,7 +232,9 @@ fn along(html: &mut String, report: &Value) {
     let step = profile.get("step_m").and_then(Value::as_f64).unwrap_or(1.0);
     let Some((&first, &last)) = chainages.first().zip(chainages.last()) else { return };
     html.push_str("<h2>Along the tunnel</h2>\n<div class=\"plots\">\n");
-    let rows: [(&str, &str, &str, &dyn Fn(f64) -> f64); 5] = [
+    // Name of the column, caption, name of the limit, and how the value is shown.
+    type Row<'a> = (&'a str, &'a str, &'a str, &'a dyn Fn(f64) -> f64);
+    let rows: [Row; 5] = [
         ("coverage_percent", "Coverage, %", "coverage_percent", &|v| v),
         ("stretch_p95", "Stretch that 95 % keep to, %", "", &|v| (v - 1.0) * 100.0),
         ("density_per_m2", "Points on a square metre", "density_per_m2", &|v| v),

@@ -9,7 +9,7 @@ pub mod surfaces;
 pub(crate) mod unrolled_grid;
 
 pub use floor::Floor;
-pub use quality::{Quality, VertexQuality};
+pub use quality::{Quality, QualityColumns, VertexQuality};
 pub use sampling::Sampling;
 pub use section_field::SectionField;
 
@@ -374,7 +374,7 @@ mod tests {
         let scan = scan(&tunnel, &ScanPlan { points: 40_000, ..ScanPlan::default() }).unwrap();
         let codes = FromClassification { furniture: vec![65], noise: vec![7, 18], ..FromClassification::default() };
         let table = codes.table().unwrap();
-        let given = |i: usize| table[if i % 10 == 0 { 65 } else { 1 }];
+        let given = |i: usize| table[if i.is_multiple_of(10) { 65 } else { 1 }];
         let (found, summary) = classify(scan.cloud.positions(), given, &tunnel.axis(), &Settings::default()).unwrap();
         assert_eq!(summary.given_points, scan.cloud.len().div_ceil(10));
         assert!(found.class.iter().step_by(10).all(|c| *c == Class::Furniture));

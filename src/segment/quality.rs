@@ -62,6 +62,9 @@ struct Cell {
     furniture: f64,
 }
 
+/// [`Quality`] as columns: start, row and column length in metres; rows and columns; noise, density, incidence; classes.
+pub type QualityColumns<'a> = ([f64; 3], [u64; 2], [&'a [f32]; 3], &'a [u8]);
+
 impl Quality {
     /// From points with normals and classes. `counts` are the scan points in each geometry point, `station` tells where
     /// a geometry point was seen from.
@@ -145,8 +148,8 @@ impl Quality {
         }
     }
 
-    /// Columns for a checkpoint: start, row and column length in metres; rows and columns; values; classes.
-    pub fn columns(&self) -> ([f64; 3], [u64; 2], [&[f32]; 3], &[u8]) {
+    /// Columns for a checkpoint.
+    pub fn columns(&self) -> QualityColumns<'_> {
         let Grid { start, row_m, column_m, rows, columns } = self.grid;
         let values = [&self.noise_m[..], &self.density_per_m2, &self.incidence_deg];
         ([start, row_m, column_m], [rows as u64, columns as u64], values, &self.class)

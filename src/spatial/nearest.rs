@@ -327,7 +327,8 @@ impl BundleTree {
     /// Collects the points of all bundles that come within the radius of a box.
     fn gather(&self, own: &Box3, radius_squared: f64, search: &mut Search) {
         let Search { stack, x, y, z, at, .. } = search;
-        (x.clear(), y.clear(), z.clear(), at.clear());
+        [&mut *x, &mut *y, &mut *z].into_iter().for_each(Vec::clear);
+        at.clear();
         let middle = (own.low + own.high) / 2.0;
         let reach = radius_squared.sqrt() * (1.0 + 1e-6);
         let (low, high) = (own.low.add_scalar(-reach), own.high.add_scalar(reach));

@@ -98,7 +98,7 @@ fn header(fields: &[&str], given_in: String) -> Result<[usize; 5], Error> {
     let mut places = [0; 5];
     for (place, accepted) in places.iter_mut().zip(COLUMNS) {
         let named = |f: &&str| accepted.contains(&f.to_lowercase().as_str());
-        *place = fields.iter().position(|f| named(f)).ok_or_else(|| Error::Handles {
+        *place = fields.iter().position(named).ok_or_else(|| Error::Handles {
             given_in: given_in.clone(),
             problem: format!("the header has no column '{}'; it has: {}", accepted[0], fields.join(", ")),
         })?;

@@ -13,9 +13,12 @@ use crate::warning::Warning;
 use laz::DecompressionSelection;
 use rayon::prelude::*;
 
+/// Least and greatest coordinates.
+type Bounds = [[f64; 3]; 2];
+
 /// How many points the header counts, and its bounding box in metres; the file holds the points, or (LAZ) the chunks that
 /// its table lists.
-pub(in super::super) fn announced_points(source: &SourceBytes) -> Result<(u64, Option<[[f64; 3]; 2]>), Error> {
+pub(in super::super) fn announced_points(source: &SourceBytes) -> Result<(u64, Option<Bounds>), Error> {
     let container = Container::read(source)?;
     Records::plan(source, &container, false, &mut Vec::new())?;
     let unit = super::crs::of(&container).and_then(|c| c.metres_per_unit).unwrap_or(1.0);
