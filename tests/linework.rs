@@ -1,5 +1,7 @@
 //! Linework through the real program: map to wall and back at the coordinates of a national grid, in all formats.
 
+#![allow(clippy::print_stderr, reason = "a skipped check is told")]
+
 use adit::io::vector::{self, Shapes, Space};
 use adit::linework::{Feature, Kind, Value};
 use adit::numeric::Vec3;

@@ -4,6 +4,8 @@
 //! One run of the bundled scan serves all tests. The checks that need Python packages or a PDF renderer run when these
 //! are there (`ADIT_PYTHON` names another interpreter) and say so when they are not.
 
+#![allow(clippy::print_stderr, reason = "a skipped check is told")]
+
 use assert_cmd::Command;
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read};

@@ -1,5 +1,7 @@
 //! `report.html` and `index.html` in a real browser, where there is one: nothing from outside, readable on phone and desktop.
 
+#![allow(clippy::print_stderr, reason = "a skipped check is told")]
+
 use assert_cmd::cargo::cargo_bin;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -60,7 +62,7 @@ fn measured(browser: &Path, page: &Path, width: u32) -> serde_json::Value {
 fn the_pages_are_readable_on_a_phone_and_ask_nobody() {
     let Some(browser) = browser() else {
         // Said by the test itself: there is nothing to look with.
-        println!("no browser on this machine, the pages are not looked at");
+        eprintln!("SKIPPED: no browser on this machine, the pages are not looked at");
         return;
     };
     let place = tempfile::tempdir().unwrap();

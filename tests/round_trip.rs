@@ -3,6 +3,8 @@
 //! `ADIT_TEST_PYTHON` names the Python (default `python3`); `ADIT_ROUND_TRIP_FOLDER` adds all LAS and LAZ files of a
 //! folder to those that are made here.
 
+#![allow(clippy::print_stderr, reason = "a skipped check is told")]
+
 use adit::cloud::Cloud;
 use adit::io::{self, PointColumns};
 use std::path::{Path, PathBuf};

@@ -15,9 +15,9 @@
 //! | symbol | meaning |
 //! |---|---|
 //! | `h` | cell of the grid |
-//! | `sigma` | width of the Gaussian weights, [`SIGMA`] `h` |
+//! | `sigma` | width of the Gaussian weights, `SIGMA` `h` |
 //!
-//! Departures: weights end at [`REACH`] `h`, normals are those of plain neighbourhoods; no thin walls: two surfaces closer
+//! Departures: weights end at `REACH` `h`, normals are those of plain neighbourhoods; no thin walls: two surfaces closer
 //! than about `3 h` blend. Guarantees: no face farther from a point than `max_gap_m` unless it is marked filled; same
 //! bytes on any number of threads. Cost: linear in points and surface; about 100 bytes a point and 2.5 KB a block of 8^3
 //! grid vertices.

@@ -1,7 +1,7 @@
 //! Side openings: where the wall lets one look into a side drift, a niche or a room, and what becomes of the surface there.
 //!
 //! On the unrolled grid an opening begins at cells that hold points far behind the wall (class *outside*) and no wall in
-//! front of them; it takes in all cells around that lie behind the wall line by more than [`BEHIND_IN_RADII`], so that
+//! front of them; it takes in all cells around that lie behind the wall line by more than `BEHIND_IN_RADII`, so that
 //! the cheeks and the floor of a side drift go with it. Relief that leads nowhere (a niche, an overbreak) is no opening.
 //! The surface is then cut off at the wall line: the opening stays a hole.
 //!
