@@ -238,12 +238,11 @@ fn spread(points: &[Vec3], count: usize) -> Vec<Vec3> {
 
 /// Whether the mesh hangs together and two of its borders are so long that they are portals.
 fn is_tube(mesh: &Mesh) -> bool {
-    let Ok(twin) = crate::mesh::topology::twins(mesh.faces()) else { return false };
-    if crate::mesh::topology::components(&twin).1 != 1 {
+    if crate::mesh::topology::components(mesh.twins()).1 != 1 {
         return false;
     }
     let at = |v: u32| mesh.vertices()[v as usize];
-    let mut lengths: Vec<f64> = crate::mesh::topology::boundary_loops(mesh.faces(), &twin)
+    let mut lengths: Vec<f64> = crate::mesh::topology::boundary_loops(mesh.faces(), mesh.twins())
         .iter()
         .map(|l| (0..l.len()).map(|i| (at(l[(i + 1) % l.len()]) - at(l[i])).norm()).sum())
         .collect();

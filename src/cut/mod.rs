@@ -83,8 +83,8 @@ impl Strip {
         if mesh.faces().is_empty() {
             return Err(Error::Empty);
         }
-        let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
-        let (component, count) = topology::components(&twin);
+        let twin = mesh.twins();
+        let (component, count) = topology::components(twin);
         if count > 1 {
             let mut sizes = vec![0usize; count];
             component.iter().for_each(|&c| sizes[c as usize] += 1);
@@ -92,7 +92,7 @@ impl Strip {
             let stray = component.iter().position(|&c| c as usize != largest).unwrap_or(0) as u32;
             return Err(Error::Components { components: count, largest: sizes[largest], stray });
         }
-        let mut loops = topology::boundary_loops(mesh.faces(), &twin);
+        let mut loops = topology::boundary_loops(mesh.faces(), twin);
         if loops.is_empty() {
             return Err(Error::Closed);
         }

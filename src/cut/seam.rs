@@ -113,8 +113,7 @@ pub fn open(mesh: Mesh, axis: &Axis, settings: &Settings) -> Result<(Strip, Summ
     };
     let coordinates: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
     let mesh = face_the_void(mesh, &coordinates, &mut summary)?;
-    let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
-    let loops = topology::boundary_loops(mesh.faces(), &twin);
+    let loops = topology::boundary_loops(mesh.faces(), mesh.twins());
     let turns: Vec<i64> = loops.iter().map(|l| winding(l, &coordinates)).collect();
     let portals = turns.iter().filter(|&&t| t != 0).count();
     match portals {
@@ -129,8 +128,8 @@ pub fn open(mesh: Mesh, axis: &Axis, settings: &Settings) -> Result<(Strip, Summ
         _ => return Err(Error::Portals { turns: turns.into_iter().filter(|&t| t != 0).collect() }),
     }
     let seam = settings.seam_angle_deg.to_radians();
-    let line = Line::of(&mesh, &twin, &coordinates, seam);
-    let split = split_along(mesh, &twin, &line, &mut summary);
+    let line = Line::of(&mesh, &coordinates, seam);
+    let split = split_along(mesh, &line, &mut summary);
     let path = cheapest_seam(&split, &coordinates, &mut summary);
     let before = split.mesh.vertices().len();
     let (mesh, dropped) = cut_along(split.mesh, &path);
@@ -203,7 +202,8 @@ struct Line {
 }
 
 impl Line {
-    fn of(mesh: &Mesh, twin: &[u32], coordinates: &[AxisCoordinates], seam: f64) -> Self {
+    fn of(mesh: &Mesh, coordinates: &[AxisCoordinates], seam: f64) -> Self {
+        let twin = mesh.twins();
         let from_seam: Vec<f64> = coordinates.iter().map(|c| wrap_angle(c.angle() - seam)).collect();
         let distance = |v: usize| coordinates[v].radius() * from_seam[v].sin();
         let mut side: Vec<i8> = from_seam.iter().map(|&a| if a < 0.0 { -1 } else { 1 }).collect();
@@ -253,7 +253,6 @@ impl Line {
 /// A mesh with the seam line among its edges.
 struct Split {
     mesh: Mesh,
-    twin: Vec<u32>,
     /// Whether a vertex lies on the line.
     on_line: Vec<bool>,
     /// Distance of a vertex from the line around the section, metres.
@@ -262,7 +261,8 @@ struct Split {
     chainage: Vec<f64>,
 }
 
-fn split_along(mesh: Mesh, twin: &[u32], line: &Line, summary: &mut Summary) -> Split {
+fn split_along(mesh: Mesh, line: &Line, summary: &mut Summary) -> Split {
+    let twin = mesh.twins();
     let mut vertices = mesh.vertices().to_vec();
     let mut away = line.away.clone();
     let mut chainage = line.chainage.clone();
@@ -298,8 +298,7 @@ fn split_along(mesh: Mesh, twin: &[u32], line: &Line, summary: &mut Summary) -> 
     }
     summary.added_vertices += vertices.len() - mesh.vertices().len();
     let mesh = Mesh::new(vertices, faces, observed).expect("splitting edges keeps a manifold");
-    let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
-    Split { mesh, twin, on_line, away, chainage }
+    Split { mesh, on_line, away, chainage }
 }
 
 /// The parts of a face whose edges are split where `mid` (for the edge leaving each corner) names a vertex.
@@ -345,7 +344,7 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
     let faces = split.mesh.faces();
     let count = split.mesh.vertices().len();
     let vertex = |c: u32| faces[(c / 3) as usize][(c % 3) as usize];
-    let loops = topology::boundary_loops(faces, &split.twin);
+    let loops = topology::boundary_loops(faces, split.mesh.twins());
     // Splitting adds vertices without coordinates of their own; the original ones decide the winding.
     let winds = |l: &[u32]| {
         let original: Vec<u32> = l.iter().copied().filter(|&v| (v as usize) < coordinates.len()).collect();
@@ -383,8 +382,8 @@ fn cheapest_seam(split: &Split, coordinates: &[AxisCoordinates], summary: &mut S
 
     // Inner half-edges leaving each vertex, in compressed rows.
     let mut first = vec![0u32; count + 1];
-    let inner = |c: u32| split.twin[c as usize] != topology::NO_TWIN;
-    let half_edges = || (0..split.twin.len() as u32).filter(|&c| inner(c));
+    let inner = |c: u32| split.mesh.twins()[c as usize] != topology::NO_TWIN;
+    let half_edges = || (0..split.mesh.twins().len() as u32).filter(|&c| inner(c));
     half_edges().for_each(|c| first[vertex(c) as usize + 1] += 1);
     for v in 0..count {
         first[v + 1] += first[v];
@@ -495,7 +494,7 @@ fn middle_of_closed_end(portal: &[u32], coordinates: &[AxisCoordinates]) -> u32 
 /// Opens the mesh along half-edges: each side gets its own copies of the vertices. Vertices without a face are
 /// dropped and counted.
 fn cut_along(mesh: Mesh, path: &[u32]) -> (Mesh, usize) {
-    let mut twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
+    let mut twin = mesh.twins().to_vec();
     for &c in path {
         let other = twin[c as usize];
         twin[c as usize] = topology::NO_TWIN;

@@ -127,7 +127,6 @@ pub struct Anchoring<'a> {
     mesh: &'a Mesh,
     normals: Vec<Vec3>,
     tree: FaceTree,
-    twin: Vec<u32>,
 }
 
 /// Anchors all points to a mesh; see the module.
@@ -138,11 +137,8 @@ pub fn anchor_points(mesh: &Mesh, points: &[Vec3], settings: &Settings) -> (Anch
 impl<'a> Anchoring<'a> {
     /// Prepares the search.
     pub fn of(mesh: &'a Mesh) -> Self {
-        let (tree, (normals, twin)) = rayon::join(
-            || FaceTree::of(mesh),
-            || (mesh.vertex_normals(), topology::twins(mesh.faces()).expect("a Mesh is manifold")),
-        );
-        Self { mesh, normals, tree, twin }
+        let (tree, normals) = rayon::join(|| FaceTree::of(mesh), || mesh.vertex_normals());
+        Self { mesh, normals, tree }
     }
 
     /// The vertex normals that [`SurfacePoint::position`] needs.
@@ -229,7 +225,7 @@ impl<'a> Anchoring<'a> {
                 return (anchor.offset.abs() <= limit).then_some(anchor);
             }
             // The side opposite to the corner with the most negative weight.
-            let across = self.twin[3 * face as usize + (lowest + 1) % 3];
+            let across = self.mesh.twins()[3 * face as usize + (lowest + 1) % 3];
             if across == topology::NO_TWIN {
                 return None;
             }
@@ -242,7 +238,7 @@ impl<'a> Anchoring<'a> {
     fn look_around(&self, face: FaceId, p: &Vec3, limit: f64) -> Option<SurfacePoint> {
         let mut best: Option<SurfacePoint> = None;
         for corner in 3 * face..3 * face + 3 {
-            for c in topology::fan(&self.twin, corner) {
+            for c in topology::fan(self.mesh.twins(), corner) {
                 let Some(anchor) = self.in_prism(c / 3, p) else { continue };
                 let inside = anchor.barycentric.iter().all(|&b| b >= INSIDE) && anchor.offset.abs() <= limit;
                 if inside && best.is_none_or(|b| anchor.offset.abs() < b.offset.abs()) {

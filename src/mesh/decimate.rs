@@ -156,7 +156,7 @@ impl Work {
                 quadric[v as usize] = quadric[v as usize].plus(&plane);
             }
         }
-        let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
+        let twin = mesh.twins();
         let mut locked = vec![false; count];
         for (c, &t) in twin.iter().enumerate() {
             if t == topology::NO_TWIN || mesh.observed()[c / 3] != mesh.observed()[(t / 3) as usize] {
@@ -282,9 +282,9 @@ mod tests {
     }
 
     fn borders(mesh: &Mesh) -> Vec<Vec<[u64; 3]>> {
-        let twin = topology::twins(mesh.faces()).unwrap();
+        let twin = mesh.twins();
         let place = |v: u32| <[f64; 3]>::from(mesh.vertices()[v as usize]).map(f64::to_bits);
-        let mut loops: Vec<Vec<[u64; 3]>> = topology::boundary_loops(mesh.faces(), &twin)
+        let mut loops: Vec<Vec<[u64; 3]>> = topology::boundary_loops(mesh.faces(), twin)
             .into_iter()
             .map(|l| {
                 let mut places: Vec<[u64; 3]> = l.into_iter().map(place).collect();

@@ -232,10 +232,10 @@ mod tests {
             assert_eq!((summary.handles_cut, summary.handles_left), (1, 0));
             // The tube's circumference is 2 pi; the way around the ring at least 4 pi.
             assert!(summary.handle_cuts_m < 8.0, "{}", summary.handle_cuts_m);
-            let twin = topology::twins(mesh.faces()).unwrap();
-            assert_eq!(topology::components(&twin).1, 1);
-            assert_eq!(genus(mesh.faces(), &twin), 0);
-            assert_eq!(topology::boundary_loops(mesh.faces(), &twin).len(), 2 + usize::from(hole));
+            let twin = mesh.twins();
+            assert_eq!(topology::components(twin).1, 1);
+            assert_eq!(genus(mesh.faces(), twin), 0);
+            assert_eq!(topology::boundary_loops(mesh.faces(), twin).len(), 2 + usize::from(hole));
         }
     }
 

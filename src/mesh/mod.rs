@@ -33,6 +33,7 @@ pub struct Mesh {
     vertices: Vec<Vec3>,
     faces: Vec<[VertexId; 3]>,
     observed: Vec<bool>,
+    twins: Vec<u32>,
 }
 
 /// Why arrays do not form a mesh.
@@ -101,8 +102,8 @@ impl Mesh {
         if observed.len() != faces.len() {
             return Err(Error::Observed { found: observed.len(), expected: faces.len() });
         }
-        topology::check_manifold(vertices.len(), &faces)?;
-        Ok(Self { vertices, faces, observed })
+        let twins = topology::check_manifold(vertices.len(), &faces)?;
+        Ok(Self { vertices, faces, observed, twins })
     }
 
     /// A mesh whose faces are all observed; see [`Mesh::new`].
@@ -112,6 +113,15 @@ impl Mesh {
     pub fn all_observed(vertices: Vec<Vec3>, faces: Vec<[VertexId; 3]>) -> Result<Self, Error> {
         let observed = vec![true; faces.len()];
         Self::new(vertices, faces, observed)
+    }
+
+    /// The same faces on other vertices: what is proved of the faces holds on.
+    ///
+    /// Panics unless there is one finite place for each vertex.
+    pub fn moved_to(&self, vertices: Vec<Vec3>) -> Self {
+        assert_eq!(vertices.len(), self.vertices.len());
+        assert!(vertices.iter().all(|v| v.iter().all(|c| c.is_finite())), "a place is not finite");
+        Self { vertices, faces: self.faces.clone(), observed: self.observed.clone(), twins: self.twins.clone() }
     }
 
     /// Vertex positions, local metres.
@@ -127,6 +137,12 @@ impl Mesh {
     /// Whether scan points support the face, one value a face.
     pub fn observed(&self) -> &[bool] {
         &self.observed
+    }
+
+    /// For each half-edge the opposite one, [`topology::NO_TWIN`] on the boundary; half-edge `3 f + i` leaves corner `i` of face
+    /// `f`.
+    pub fn twins(&self) -> &[u32] {
+        &self.twins
     }
 
     /// The three corner positions of a face.

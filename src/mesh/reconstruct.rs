@@ -380,7 +380,7 @@ fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<War
         .filter(|&f| !mesh.observed()[f])
         .map(|f| mesh.double_area_vector(f as u32).norm() / 2.0)
         .sum();
-    let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
+    let twin = mesh.twins();
     Summary {
         method,
         reason,
@@ -388,7 +388,7 @@ fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<War
         faces: mesh.faces().len(),
         area_m2,
         filled_percent: 100.0 * filled / area_m2,
-        boundary_loops: topology::boundary_loops(mesh.faces(), &twin).len(),
+        boundary_loops: topology::boundary_loops(mesh.faces(), twin).len(),
         openings: Vec::new(),
         section: None,
         implicit: None,

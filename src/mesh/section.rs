@@ -733,7 +733,7 @@ mod tests {
     }
 
     fn loops(mesh: &Mesh) -> usize {
-        topology::boundary_loops(mesh.faces(), &topology::twins(mesh.faces()).unwrap()).len()
+        topology::boundary_loops(mesh.faces(), mesh.twins()).len()
     }
 
     const OPTIONS: Options = Options {

@@ -104,11 +104,12 @@ impl EdgeGroups {
     }
 }
 
-/// Proves that faces index existing vertices, edges have at most two opposite faces and vertices have one fan.
+/// Proves that faces index existing vertices, edges have at most two opposite faces and vertices have one fan; returns the
+/// [`twins`].
 ///
 /// # Errors
 /// The first defect found, see [`Error`].
-pub fn check_manifold(vertex_count: usize, faces: &[[VertexId; 3]]) -> Result<(), Error> {
+pub(super) fn check_manifold(vertex_count: usize, faces: &[[VertexId; 3]]) -> Result<Vec<u32>, Error> {
     for (f, &corners) in faces.iter().enumerate() {
         let [a, b, c] = corners;
         if corners.iter().any(|&v| v as usize >= vertex_count) || a == b || b == c || c == a {
@@ -136,7 +137,7 @@ pub fn check_manifold(vertex_count: usize, faces: &[[VertexId; 3]]) -> Result<()
             return Err(Error::NotManifoldVertex { vertex: v as VertexId, fans });
         }
     }
-    Ok(())
+    Ok(twin)
 }
 
 /// The corners around one vertex that are reached from `corner` by crossing edges, in turning order; starts at the

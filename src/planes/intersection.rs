@@ -25,7 +25,7 @@ pub struct Curve {
 /// A curve ends at the border of the surface, and where the plane ends.
 pub fn curves(chart: &Chart, normal: &Vec3, through: &Vec3, radius_m: f64) -> Vec<Curve> {
     let mesh = chart.strip().mesh();
-    let twin = topology::twins(mesh.faces()).expect("a Mesh is manifold");
+    let twin = mesh.twins();
     let distance: Vec<f64> = mesh.vertices().iter().map(|p| normal.dot(&(p - through))).collect();
     let from = |c: u32| mesh.faces()[(c / 3) as usize][(c % 3) as usize];
     // A half-edge and its twin are one edge.

@@ -14,7 +14,7 @@ use super::triangle_shapes::Shapes;
 use super::{Error, SolveSummary};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
-use crate::mesh::topology::{NO_TWIN, twins};
+use crate::mesh::topology::NO_TWIN;
 use crate::numeric::{Vec2, sparse};
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
@@ -58,7 +58,7 @@ impl<'a> AngleProblem<'a> {
         let (faces, n) = (mesh.faces(), mesh.vertices().len());
         let mut free = vec![true; n];
         faces.iter().flatten().for_each(|&v| free[v as usize] = false);
-        let twin = twins(faces).expect("a Mesh is manifold");
+        let twin = mesh.twins();
         for (c, _) in twin.iter().enumerate().filter(|(_, t)| **t == NO_TWIN) {
             free[faces[c / 3][c % 3] as usize] = true;
             free[faces[c / 3][(c + 1) % 3] as usize] = true;

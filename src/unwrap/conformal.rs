@@ -3,21 +3,22 @@
 //!
 //! For (u, v) per vertex, `E_C = E_D - A`: Dirichlet energy minus signed area, zero for a similarity and positive else
 //! (U. Pinkall and K. Polthier, "Computing Discrete Minimal Surfaces and Their Conjugates", Experimental Mathematics
-//! 2(1), 1993, doi:10.1080/10586458.1993.10504266). As `E_C = 1/2 x^T M x` with interleaved unknowns (u0, v0, u1, ...),
-//! `M = [L 0; 0 L] - A`: the cotangent Laplacian twice, and the area as a sum over boundary half-edges only, hole loops
-//! included. `M` has no more entries than two Laplacians and the boundary, and it commutes with a quarter turn of all
-//! (u, v), so that one factorization serves all pins and loads.
+//! 2(1), 1993, doi:10.1080/10586458.1993.10504266). With one complex unknown a vertex, `z = u + i v`, it is
+//! `E_C = 1/2 z^* M z` with the Hermitian `M = L + i K`: the cotangent Laplacian, and the area as a sum over boundary
+//! half-edges only, hole loops included (`K` is +1/2 where the boundary runs from row to column, -1/2 where it runs back).
+//! `M` has the entries of one real Laplacian, a factorization needs a quarter of the arithmetic of one with u and v as unknowns
+//! of their own, and a quarter turn of all (u, v) is a product with `i`: one factorization serves all pins and loads.
 
 use crate::cut::Strip;
 use crate::numeric::Vec2;
-use crate::numeric::sparse::{Analysis, Cholesky, Error, Pattern};
+use crate::numeric::sparse::{Analysis, Cholesky, Complex, Error, Pattern};
 
 /// `M` with its mesh.
 pub(super) struct ConformalForm {
-    /// Vertices coupled along edges; orders the elimination.
-    edges: Pattern,
+    /// Vertices coupled along edges.
     pattern: Pattern,
-    values: Vec<f64>,
+    analysis: Analysis,
+    values: Vec<Complex>,
     /// Whether a vertex is on the boundary.
     boundary: Vec<bool>,
 }
@@ -65,46 +66,17 @@ pub(super) fn centre_unused(used: &[bool], uv: &mut [Vec2]) -> usize {
 
 impl ConformalForm {
     /// Assembles `M` from the cotangents of each face's angles.
-    pub fn new(strip: &Strip, cotangents: impl Fn(usize) -> [f64; 3]) -> Result<Self, Error> {
+    pub fn new(strip: &Strip, cotangents: impl Fn(usize) -> [f64; 3] + Send) -> Result<Self, Error> {
         let (faces, n) = (strip.mesh().faces(), strip.mesh().vertices().len());
-        let edges = Pattern::of_vertices(n, faces)?;
-        let laplacian = cotangent_laplacian(&edges, faces, cotangents);
-        // +1 where the boundary runs from the lower to the higher vertex, -1 where it runs back, 0 inside.
-        let mut boundary_run = vec![0i8; edges.entries()];
-        let mut boundary = vec![false; n];
-        for rim in std::iter::once(strip.outer_loop()).chain(strip.hole_loops().iter().map(Vec::as_slice)) {
-            for (k, &a) in rim.iter().enumerate() {
-                let b = rim[(k + 1) % rim.len()];
-                boundary[a as usize] = true;
-                let slot = edges.slot(a, b).expect("a boundary edge is an edge");
-                boundary_run[slot] += if a < b { 1 } else { -1 };
-            }
-        }
-        let coupled = boundary_run.iter().filter(|&&r| r != 0).count();
-        let mut pattern = PatternBuilder::with_capacity(2 * n, 2 * (edges.entries() + coupled));
-        for j in 0..n {
-            let first = edges.diagonal(j);
-            // 2 Area = sum over boundary half-edges i -> k of u_i v_k - u_k v_i.
-            let column = || (first + 1..).zip(&edges.column(j)[1..]);
-            pattern.push(2 * j as u32, laplacian[first]);
-            for (slot, &i) in column() {
-                pattern.push(2 * i, laplacian[slot]);
-                if boundary_run[slot] != 0 {
-                    pattern.push(2 * i + 1, -0.5 * f64::from(boundary_run[slot]));
-                }
-            }
-            pattern.end_column();
-            pattern.push(2 * j as u32 + 1, laplacian[first]);
-            for (slot, &i) in column() {
-                if boundary_run[slot] != 0 {
-                    pattern.push(2 * i, 0.5 * f64::from(boundary_run[slot]));
-                }
-                pattern.push(2 * i + 1, laplacian[slot]);
-            }
-            pattern.end_column();
-        }
-        let (pattern, values) = pattern.finish();
-        Ok(Self { edges, pattern, values, boundary })
+        let pattern = Pattern::of_vertices(n, faces)?;
+        let (analysis, (values, boundary)) = rayon::join(
+            || Analysis::new(&pattern),
+            || {
+                let laplacian = cotangent_laplacian(&pattern, faces, cotangents);
+                with_area(strip, &pattern, laplacian.into_iter().map(Complex::from).collect())
+            },
+        );
+        Ok(Self { analysis: analysis?, pattern, values, boundary })
     }
 
     /// Which vertices are on a boundary loop.
@@ -114,38 +86,53 @@ impl ConformalForm {
 
     /// Minimizes `E_C` with two vertices held where they are told. Returns the chart and the relative residual.
     pub fn solve_pinned(mut self, pins: [(u32, Vec2); 2]) -> Result<(Vec<Vec2>, f64), Error> {
-        let mut right = vec![0.0; self.pattern.unknowns()];
-        let at = |j: usize| pins.iter().find(|p| p.0 as usize == j / 2).map(|p| p.1[j % 2]);
+        let mut right = vec![Complex::default(); self.pattern.unknowns()];
+        let at = |v: usize| pins.iter().find(|p| p.0 as usize == v).map(|p| Complex::new(p.1.x, p.1.y));
         self.pattern.fix_unknowns(&mut self.values, &mut right, at);
-        let x = self.factor()?.solve_refined(&self.pattern, &self.values, &right);
-        let residual = self.pattern.relative_residual(&self.values, &x, &right);
-        Ok((pair_up(&x), residual))
+        let z = Cholesky::new(&self.pattern, &self.analysis, &self.values)?.solve_refined(
+            &self.pattern,
+            &self.values,
+            &right,
+        );
+        let residual = self.pattern.relative_residual(&self.values, &z, &right);
+        Ok((to_chart(&z), residual))
     }
 
     /// Factors `M + shift`, where the shift `sigma` is added to the diagonal at boundary vertices only (the matrix `B` of
     /// Mullen et al.): `M` itself leaves the position free, and on a developable surface also size and heading.
     pub fn factor_shifted(mut self, sigma: f64) -> Result<ShiftedForm, Error> {
         let boundary = &self.boundary;
-        self.pattern.add_to_diagonal(&mut self.values, |j| if boundary[j / 2] { sigma } else { 0.0 });
-        let factor = self.factor()?;
+        self.pattern.add_to_diagonal(&mut self.values, |v| if boundary[v] { sigma } else { 0.0 });
+        let factor = Cholesky::new(&self.pattern, &self.analysis, &self.values)?;
         Ok(ShiftedForm { form: self, factor, sigma })
-    }
-
-    fn factor(&self) -> Result<Cholesky, Error> {
-        Cholesky::new(&self.pattern, &Analysis::of_paired(&self.edges, &self.pattern)?, &self.values)
     }
 
     /// Mean diagonal entry of `M`: the scale that a shift is measured against.
     pub fn mean_diagonal(&self) -> f64 {
         let n = self.pattern.unknowns();
-        (0..n).map(|j| self.values[self.pattern.diagonal(j)]).sum::<f64>() / n.max(1) as f64
+        (0..n).map(|v| self.values[self.pattern.diagonal(v)].re).sum::<f64>() / n.max(1) as f64
     }
+}
+
+/// Takes the area of the map from the values of `L`; also tells which vertices are on a boundary loop.
+fn with_area(strip: &Strip, pattern: &Pattern, mut values: Vec<Complex>) -> (Vec<Complex>, Vec<bool>) {
+    let mut boundary = vec![false; pattern.unknowns()];
+    for rim in std::iter::once(strip.outer_loop()).chain(strip.hole_loops().iter().map(Vec::as_slice)) {
+        for (k, &a) in rim.iter().enumerate() {
+            let b = rim[(k + 1) % rim.len()];
+            boundary[a as usize] = true;
+            // 2 Area = sum over boundary half-edges a -> b of u_a v_b - u_b v_a; the row stored is the higher vertex.
+            let slot = pattern.slot(a, b).expect("a boundary edge is an edge");
+            values[slot].im -= if a < b { 0.5 } else { -0.5 };
+        }
+    }
+    (values, boundary)
 }
 
 /// A factored `M + sigma B`.
 pub(super) struct ShiftedForm {
     form: ConformalForm,
-    factor: Cholesky,
+    factor: Cholesky<Complex>,
     sigma: f64,
 }
 
@@ -165,48 +152,26 @@ impl ShiftedForm {
 
     /// Solves for a load of one vector a vertex. Returns the chart and the relative residual.
     pub fn solve(&self, load: &[Vec2]) -> (Vec<Vec2>, f64) {
-        let right = interleave(load);
-        let form = &self.form;
-        let x = self.factor.solve_refined(&form.pattern, &form.values, &right);
-        let residual = form.pattern.relative_residual(&form.values, &x, &right);
-        (pair_up(&x), residual)
+        let (right, form) = (to_complex(load), &self.form);
+        let z = self.factor.solve_refined(&form.pattern, &form.values, &right);
+        let residual = form.pattern.relative_residual(&form.values, &z, &right);
+        (to_chart(&z), residual)
+    }
+
+    /// [`Self::solve`] without refinement, for a round that is not the last.
+    pub fn solve_roughly(&self, load: &[Vec2]) -> Vec<Vec2> {
+        let mut z = to_complex(load);
+        self.factor.solve_in_place(&mut z);
+        to_chart(&z)
     }
 }
 
-/// A pattern and its values, written column after column.
-struct PatternBuilder {
-    starts: Vec<u32>,
-    rows: Vec<u32>,
-    values: Vec<f64>,
+fn to_complex(load: &[Vec2]) -> Vec<Complex> {
+    load.iter().map(|l| Complex::new(l.x, l.y)).collect()
 }
 
-impl PatternBuilder {
-    fn with_capacity(unknowns: usize, entries: usize) -> Self {
-        let mut starts = Vec::with_capacity(unknowns + 1);
-        starts.push(0);
-        Self { starts, rows: Vec::with_capacity(entries), values: Vec::with_capacity(entries) }
-    }
-
-    fn push(&mut self, row: u32, value: f64) {
-        self.rows.push(row);
-        self.values.push(value);
-    }
-
-    fn end_column(&mut self) {
-        self.starts.push(self.rows.len() as u32);
-    }
-
-    fn finish(self) -> (Pattern, Vec<f64>) {
-        (Pattern::from_columns(self.starts, self.rows), self.values)
-    }
-}
-
-fn interleave(uv: &[Vec2]) -> Vec<f64> {
-    uv.iter().flat_map(|p| [p.x, p.y]).collect()
-}
-
-fn pair_up(x: &[f64]) -> Vec<Vec2> {
-    x.chunks_exact(2).map(|p| Vec2::new(p[0], p[1])).collect()
+fn to_chart(z: &[Complex]) -> Vec<Vec2> {
+    z.iter().map(|z| Vec2::new(z.re, z.im)).collect()
 }
 
 /// Two boundary vertices far from each other: the farthest from the first of the outer loop, and the farthest from that.

@@ -299,7 +299,7 @@ fn segments_cross([a, b]: [Vec2; 2], [c, d]: [Vec2; 2]) -> bool {
 pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
     let faces = mesh.faces();
     let count = mesh.vertices().len();
-    let twin = topology::twins(faces).expect("a Mesh is manifold");
+    let twin = mesh.twins();
     let mut border = vec![false; count];
     let mut unique: Vec<(u32, u32, bool)> = Vec::with_capacity(twin.len() / 2 + 1);
     let mut squared = 0.0;
@@ -317,7 +317,6 @@ pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
             border[b as usize] = true;
         }
     }
-    drop(twin);
     if unique.is_empty() {
         return mesh.clone();
     }
@@ -358,8 +357,7 @@ pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
             })
             .collect();
     }
-    let finite = "averages of finite vertices are finite";
-    let smooth = Mesh::new(positions, faces.to_vec(), mesh.observed().to_vec()).expect(finite);
+    let smooth = mesh.moved_to(positions);
     let normals = smooth.vertex_normals();
     let along_normals = mesh
         .vertices()
@@ -368,7 +366,7 @@ pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
         .zip(&normals)
         .map(|((from, to), normal)| from + normal * normal.dot(&(to - from)))
         .collect();
-    Mesh::new(along_normals, faces.to_vec(), mesh.observed().to_vec()).expect(finite)
+    mesh.moved_to(along_normals)
 }
 
 #[cfg(test)]

@@ -137,7 +137,7 @@ impl<'a> UnrolledFans<'a> {
                 (std::array::from_fn(|k| p[(k + 1) % 3] - p[k]), half_cotangents(shape))
             })
             .collect();
-        let twin = topology::twins(faces).expect("a Mesh is manifold");
+        let twin = mesh.twins();
         let mut laid = vec![[Vec2::zeros(); 3]; faces.len()];
         let mut done = vec![false; mesh.vertices().len()];
         for corner in 0..3 * faces.len() as u32 {
@@ -145,7 +145,7 @@ impl<'a> UnrolledFans<'a> {
             if std::mem::replace(&mut done[vertex], true) {
                 continue;
             }
-            let around = || topology::fan(&twin, corner);
+            let around = || topology::fan(twin, corner);
             let angle = |c: u32| shapes[c as usize / 3].angles()[c as usize % 3];
             let first = around().next().expect("a corner is in its fan");
             let is_inner = twin[first as usize] != topology::NO_TWIN;

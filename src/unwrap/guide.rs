@@ -167,7 +167,7 @@ pub(crate) fn winding(border: &[u32], coordinates: &[AxisCoordinates]) -> f64 {
 /// which two ways around disagree.
 fn continuous_angles(strip: &Strip, coordinates: &[AxisCoordinates]) -> (Vec<f64>, usize) {
     let faces = strip.mesh().faces();
-    let twin = topology::twins(faces).expect("a Mesh is manifold");
+    let twin = strip.mesh().twins();
     let raw: Vec<f64> = coordinates.iter().map(AxisCoordinates::angle).collect();
     let mut angles = vec![f64::NAN; raw.len()];
     let mut reached = vec![false; faces.len()];

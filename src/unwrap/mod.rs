@@ -374,26 +374,30 @@ pub fn flatten_guided(strip: Strip, guide: Option<Guide>, settings: &Settings) -
     if let Some(value) = settings.smoothing_m.filter(|s| !(*s >= 0.0 && s.is_finite())) {
         return Err(Error::Setting { key: "smoothing_m", value, must: "0 or more metres" });
     }
-    let (mut uv, solve) = settings.method.solve(&strip, guide.as_ref())?;
+    let smoothing_m = settings.smoothing_m.unwrap_or_else(|| {
+        let girth = guide.as_ref().map_or_else(|| strip.mesh().area().sqrt(), |g| g.summary().section.mean_girth_m);
+        SMOOTHING_M.min(girth * SMOOTHING_OF_GIRTH)
+    });
+    // Most solvers leave a core idle for a while.
+    let (solved, smoothed) = rayon::join(
+        || settings.method.solve(&strip, guide.as_ref()),
+        || (smoothing_m > 0.0).then(|| distortion::smoothed_surface(strip.mesh(), smoothing_m)),
+    );
+    let (mut uv, solve) = solved?;
     let placement = registration::place(&strip, guide.as_ref(), settings.method.freedom(), &mut uv)?;
     let chart = Chart::new(strip, uv)?;
 
-    let mesh = chart.strip().mesh();
-    let (flipped_faces, collapsed_faces) = distortion::flipped_faces(mesh, chart.uv());
+    let (mesh, uv) = (chart.strip().mesh(), chart.uv());
+    let (flipped_faces, collapsed_faces) = distortion::flipped_faces(mesh, uv);
     let mut warnings = solve.warnings.clone();
     if let Some(guide) = &guide {
         warnings.extend(guide.summary().warnings.iter().cloned());
     }
-    let smoothing_m = settings.smoothing_m.unwrap_or_else(|| {
-        let girth = guide.as_ref().map_or_else(|| mesh.area().sqrt(), |g| g.summary().section.mean_girth_m);
-        SMOOTHING_M.min(girth * SMOOTHING_OF_GIRTH)
-    });
-    let uv = chart.uv();
     let ((distortion, overlaps), (smoothed, readability)) = rayon::join(
         || (Distortion::of(mesh, uv), distortion::border_crossings(chart.strip(), uv)),
         || {
-            let smooth = || Distortion::of(&distortion::smoothed_surface(mesh, smoothing_m), uv);
-            ((smoothing_m > 0.0).then(smooth), guide.as_ref().map(|guide| Readability::of(mesh, uv, guide)))
+            let smoothed = smoothed.map(|surface| Distortion::of(&surface, uv));
+            (smoothed, guide.as_ref().map(|guide| Readability::of(mesh, uv, guide)))
         },
     );
     let summary = Summary {
