@@ -185,8 +185,7 @@ fn face_the_void(mesh: Mesh, coordinates: &[AxisCoordinates], summary: &mut Summ
         "faces-reversed",
         "the faces of the mesh showed their back to the tunnel axis; all were reversed, so that the map is seen from inside",
     ));
-    let faces = mesh.faces().iter().map(|&[a, b, c]| [a, c, b]).collect();
-    Ok(Mesh::new(mesh.vertices().to_vec(), faces, mesh.observed().to_vec()).expect("reversing keeps a manifold"))
+    Ok(mesh.reversed())
 }
 
 /// The seam line on the mesh: the side of each vertex, and where edges are crossed.

@@ -115,6 +115,16 @@ impl Mesh {
         Self::new(vertices, faces, observed)
     }
 
+    /// The same surface seen from its other side.
+    pub fn reversed(mut self) -> Self {
+        // With corners 1 and 2 swapped, half-edge i becomes half-edge 2 - i of its face.
+        let turned = |c: u32| if c == topology::NO_TWIN { c } else { c - c % 3 + 2 - c % 3 };
+        self.faces.iter_mut().for_each(|f| f.swap(1, 2));
+        self.twins.chunks_exact_mut(3).for_each(|t| t.swap(0, 2));
+        self.twins.iter_mut().for_each(|t| *t = turned(*t));
+        self
+    }
+
     /// The same faces on other vertices: what is proved of the faces holds on.
     ///
     /// Panics unless there is one finite place for each vertex.
@@ -185,5 +195,20 @@ impl Mesh {
             }
         }
         observed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reversed_mesh_is_the_one_made_of_reversed_faces() {
+        let v = vec![Vec3::zeros(), Vec3::x(), Vec3::y(), Vec3::z()];
+        let faces = vec![[0, 2, 1], [0, 1, 3], [1, 2, 3]];
+        let turned = faces.iter().map(|&[a, b, c]| [a, c, b]).collect();
+        let mesh = Mesh::all_observed(v.clone(), faces).unwrap();
+        assert_eq!(mesh.clone().reversed(), Mesh::all_observed(v, turned).unwrap());
+        assert_eq!(mesh.clone().reversed().reversed(), mesh);
     }
 }

@@ -158,11 +158,20 @@ impl ShiftedForm {
         (to_chart(&z), residual)
     }
 
-    /// [`Self::solve`] without refinement, for a round that is not the last.
-    pub fn solve_roughly(&self, load: &[Vec2]) -> Vec<Vec2> {
-        let mut z = to_complex(load);
-        self.factor.solve_in_place(&mut z);
+    /// [`Self::solve`] from a chart that is nearly the solution: solving for what is missing refines it on the way.
+    pub fn solve_from(&self, start: &[Vec2], load: &[Vec2]) -> Vec<Vec2> {
+        let form = &self.form;
+        let mut z = to_complex(start);
+        let mut missing = form.pattern.multiply(&form.values, &z);
+        missing.iter_mut().zip(load).for_each(|(m, l)| *m = Complex::new(l.x, l.y) - *m);
+        self.factor.solve_in_place(&mut missing);
+        z.iter_mut().zip(&missing).for_each(|(z, m)| *z += m);
         to_chart(&z)
+    }
+
+    /// The relative residual of a chart under a load.
+    pub fn residual(&self, uv: &[Vec2], load: &[Vec2]) -> f64 {
+        self.form.pattern.relative_residual(&self.form.values, &to_complex(uv), &to_complex(load))
     }
 }
 

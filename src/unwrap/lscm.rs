@@ -200,12 +200,9 @@ fn even_rounds(
         // The rotations come with the weight of the tie, so that the map has its own size in every round.
         load.iter_mut().for_each(|l| *l *= tie);
         shifted.make_up_for_shift(&mut load, &uv);
-        if round < rounds {
-            uv = shifted.solve_roughly(&load);
-        } else {
-            let (last, residual) = shifted.solve(&load);
-            uv = last;
-            summary.residual = Some(residual);
+        uv = shifted.solve_from(&uv, &load);
+        if round == rounds {
+            summary.residual = Some(shifted.residual(&uv, &load));
         }
     }
     summary.iterations = rounds;
