@@ -102,11 +102,7 @@ pub fn checks(limits: &Limits, report: &Value) -> Vec<Check> {
     let cell_m = at("/map/cell_m");
     let roundtrip_px = at("/roundtrip/p99_m").zip(cell_m).map(|(m, cell)| m / cell);
     let lost = at("/ingest/points").zip(at("/points/points")).map(|(read, written)| (read - written).max(0.0));
-    let stations = at("/ingest/stations").unwrap_or(0.0);
-    let one_station = match stations {
-        s if s < 2.0 => "fewer than two stations are known",
-        _ => "the run does not compare its stations",
-    };
+    let (stations_told, station_residual) = worst_overlap(report);
     // Roughness is no distortion of the map, so the smoothed surface counts, unless smoothing itself shrank the tube.
     let raw_stretch = at("/unwrap/stretch/p95");
     let stretch = at("/unwrap/smoothed/stretch/p95").into_iter().chain(raw_stretch).reduce(f64::min);
@@ -200,10 +196,10 @@ pub fn checks(limits: &Limits, report: &Value) -> Vec<Check> {
         .worst_at(worst("noise_m")),
         most(
             "station_residual_m",
-            "distance between what two stations saw",
+            &stations_told,
             "m",
             limits.station_residual_m,
-            or(at("/ingest/station_residual_m"), if from_mesh { needs_points } else { one_station }),
+            or(station_residual, if from_mesh { needs_points } else { "no two stations saw the same wall" }),
         ),
         least("length_m", "length of the axis", "m", limits.length_m, or(at("/axis/length_m"), untold)),
         most("duration_s", "duration", "s", limits.duration_s, or(at("/seconds"), untold)),
@@ -297,6 +293,20 @@ fn drift(drift: &Drift, report: &Value) -> Vec<Check> {
         .collect()
 }
 
+/// What the residual between stations is called, and the largest one, metres: the median distance of one station's points from
+/// the planes of the other.
+fn worst_overlap(report: &Value) -> (String, Option<f64>) {
+    let overlaps = report.pointer("/ingest/overlaps").and_then(Value::as_array).into_iter().flatten();
+    let medians = overlaps.filter_map(|o| Some((o.get("stations")?, o.get("median_m")?.as_f64()?)));
+    match medians.max_by(|a, b| a.1.total_cmp(&b.1)) {
+        None => ("distance between what two stations saw".to_owned(), None),
+        Some((pair, median)) => {
+            let name = |i: usize| pair.get(i).and_then(Value::as_str).unwrap_or("?");
+            (format!("distance between what stations '{}' and '{}' saw", name(0), name(1)), Some(median))
+        }
+    }
+}
+
 /// The stretch that a chainage map of this tunnel must have at the walls of its sharpest bend.
 ///
 /// A wall at half width `w` of a bend with radius `r` is `1 + w / r` as long as its chainage.
@@ -336,6 +346,15 @@ mod tests {
         let report = json!({ "ingest": { "points": 10 }, "points": { "points": 9 } });
         let lost = check(&report, "lost_points");
         assert_eq!((lost.status, lost.value), (Status::Fail, Some(1.0)));
+    }
+
+    #[test]
+    fn the_stations_that_disagree_most_are_judged_and_named() {
+        let pair = |a: &str, b: &str, median: f64| json!({ "stations": [a, b], "median_m": median, "points": 900 });
+        let report = json!({ "ingest": { "overlaps": [pair("north", "middle", 0.003), pair("middle", "south", 0.031)] } });
+        let residual = check(&report, "station_residual_m");
+        assert_eq!((residual.status, residual.value), (Status::Warn, Some(0.031)));
+        assert!(residual.message.contains("'middle' and 'south'"), "{}", residual.message);
     }
 
     #[test]

@@ -10,7 +10,7 @@
 //!
 //! | symbol | meaning |
 //! |---|---|
-//! | `E_C`, `M` | conformal energy, `E_C = 1/2 x^T M x` (`L_C` in Mullen et al.); see `conformal` |
+//! | `E_C`, `M` | conformal energy, `E_C = 1/2 z^* M z` with `z = u + i v` (`L_C` in Mullen et al.); see `conformal` |
 //! | `B` | identity on boundary vertices, zero inside |
 //! | `sigma` | shift: `M + sigma B` is what is factored by the spectral and the even form |
 //! | `R_t` | rotation of face `t`, closest to its Jacobian |
@@ -20,7 +20,7 @@
 //! triangle, so `E_C` is about `eps * integral |f'|^2` with the local scale `|f'|` and a small `eps`:
 //! * `pinned`: two boundary vertices are held. The cheapest way to keep two *points* apart is to stretch the
 //!   surroundings of the points, so the scale has two peaks, and any amount of scale may be traded for a little angle.
-//! * `spectral`: `x^T B x = 1`, no pins. The scale of a strip is largest in the middle and falls off to the portals.
+//! * `spectral`: `z^* B z = 1`, no pins. The scale of a strip is largest in the middle and falls off to the portals.
 //! * `even` (default, ours): no pins; instead each triangle is tied to a rotated copy of itself,
 //!   `E_C + tie * sum_t area_t |J_t - R_t|^2 / 2`, so weakly (`tie` = 0.01) that angles hardly notice, but more than
 //!   `eps`, so that the scale has no reason to drift. `R_t` comes from the guide, or from the pinned solution, and from
