@@ -5,6 +5,7 @@ use super::mesh_scan::MeshBuilder;
 use super::source_bytes::SourceBytes;
 use crate::numeric::{Vec2, Vec3};
 use crate::warning::Warning;
+use std::borrow::Cow;
 use std::collections::HashMap;
 
 fn words(line: &str) -> impl Iterator<Item = &str> {
@@ -31,7 +32,8 @@ pub(super) fn obj(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     let mut seams = false;
     let mut corners: Vec<f64> = Vec::new();
     let mut other: u64 = 0;
-    for (number_of, line) in text.lines().enumerate() {
+    for (number_of, line) in whole_lines(&text) {
+        let line = &*line;
         let mut parts = words(line);
         let bad = |cause: &str| at_line(source, number_of, line, cause);
         match parts.next() {
@@ -79,6 +81,20 @@ pub(super) fn obj(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     Ok(builder)
 }
 
+/// Lines with their numbers; those that end with a backslash go on in the next one.
+fn whole_lines(text: &str) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
+    let mut lines = text.lines().enumerate();
+    std::iter::from_fn(move || {
+        let (number, first) = lines.next()?;
+        let mut line = Cow::Borrowed(first);
+        while let Some(begun) = line.trim_end().strip_suffix('\\') {
+            let next = lines.next().map_or("", |(_, l)| l);
+            line = Cow::Owned(format!("{begun} {next}"));
+        }
+        Some((number, line))
+    })
+}
+
 /// A one-based or, from the end, negative OBJ index.
 fn index(word: Option<&str>, count: usize) -> Option<usize> {
     let index: i64 = word?.parse().ok()?;
@@ -99,10 +115,14 @@ pub(super) fn off(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     let (mut line, mut head) = lines.next().ok_or_else(ended)?;
     let prefix_end = head.find(|c: char| !c.is_ascii_alphabetic() && c != '4').unwrap_or(head.len());
     let prefix = &head[..prefix_end];
-    if !prefix.ends_with("OFF") || prefix.contains('4') {
+    // The keyword may be missing: then the counts come first.
+    let counts_first = words(head).count() >= 2 && words(head).all(|w| w.parse::<u64>().is_ok());
+    if !counts_first && (!prefix.ends_with("OFF") || prefix.contains('4')) {
         return Err(at_line(source, line, head, "is no OFF header"));
     }
-    head = head[prefix_end..].trim();
+    if !counts_first {
+        head = head[prefix_end..].trim();
+    }
     if head.starts_with("BINARY") {
         return Err(Error::unsupported(source.path(), "binary OFF", "save it as text OFF or PLY"));
     }
@@ -154,8 +174,18 @@ pub(super) fn stl(source: &SourceBytes) -> Result<MeshBuilder, Error> {
         })
     };
     let count = bytes.get(80..84).map(|b| u32::from_le_bytes(b.try_into().expect("four bytes")) as usize);
-    let binary = count.filter(|&c| bytes.len() as u128 == 84 + 50 * c as u128);
+    let needed = count.map(|c| 84 + 50 * c as u128);
+    let is_text = bytes.trim_ascii_start().get(..5).is_some_and(|w| w.eq_ignore_ascii_case(b"solid"));
+    // Binary files may begin with "solid" too: then only a size that fits to the byte tells them from text.
+    let binary =
+        count.filter(|_| needed.is_some_and(|n| bytes.len() as u128 == n || (!is_text && bytes.len() as u128 > n)));
     if let Some(count) = binary {
+        if needed.is_some_and(|n| bytes.len() as u128 > n) {
+            let rest = bytes.len() - 84 - 50 * count;
+            builder
+                .warnings
+                .push(Warning::new("trailing-bytes", format!("{rest} bytes after its {count} facets are not read")));
+        }
         builder.single_precision = true;
         for facet in bytes[84..].chunks_exact(50).take(count) {
             let corner = |k: usize| {
@@ -167,12 +197,12 @@ pub(super) fn stl(source: &SourceBytes) -> Result<MeshBuilder, Error> {
             let triangle = [0, 1, 2].map(|k| vertex(&mut builder, corner(k)));
             builder.triangle(triangle, None);
         }
-    } else if bytes.trim_ascii_start().starts_with(b"solid") {
+    } else if is_text {
         let text = String::from_utf8_lossy(&bytes);
         let mut triangle = Vec::new();
         for (n, line) in text.lines().enumerate() {
             let mut parts = words(line);
-            match parts.next() {
+            match parts.next().map(str::to_ascii_lowercase).as_deref() {
                 Some("vertex") => {
                     let v = [number(parts.next()), number(parts.next()), number(parts.next())];
                     let [Some(x), Some(y), Some(z)] = v else {

@@ -28,6 +28,20 @@ struct Field {
 }
 
 impl Field {
+    /// Appends the bytes of a number given as text.
+    fn put(&self, word: &str, bytes: &mut Vec<u8>) -> Option<()> {
+        match (self.kind, self.size) {
+            (b'F', 4) => bytes.extend(word.parse::<f32>().ok()?.to_le_bytes()),
+            (b'F', _) => bytes.extend(word.parse::<f64>().ok()?.to_le_bytes()),
+            // Integers may be written as 255.0; two's complement holds both signs.
+            (_, size) => {
+                let whole = word.parse::<i128>().ok().or_else(|| word.parse::<f64>().ok().map(|v| v as i128))?;
+                bytes.extend(&whole.to_le_bytes()[..size]);
+            }
+        }
+        Some(())
+    }
+
     fn get(&self, bytes: &[u8]) -> f64 {
         macro_rules! number {
             ($type:ty) => {
@@ -82,12 +96,12 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
         return Err(Error::bad(path, cause, "export the scan again with all three coordinates"));
     };
     let table = match header.data {
+        Data::Ascii if packed.is_some() || header.fields.iter().any(|f| f.count != 1) => {
+            let bytes = records_of_text(source, &header)?;
+            fill(&header, &bytes, &record_places(&header), packed, first_packed, &roles)
+        }
         Data::Ascii => {
-            let columns = header.fields.iter().map(|f| f.count).sum();
-            if packed.is_some() || header.fields.iter().any(|f| f.count != 1) {
-                let cause = "text with packed colours or vector fields";
-                return Err(Error::unsupported(path, cause, "save it as binary PCD"));
-            }
+            let columns = header.fields.len();
             let line = Line { separator: b' ', decimal_comma: false, columns };
             let (table, ..) = parse_rows(source, header.data_at, header.lines + 1, Some(header.points), &line, &roles)?;
             if (table.len() as u64) < header.points {
@@ -97,19 +111,8 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
             table
         }
         Data::Binary => {
-            let stride: usize = header.fields.iter().map(|f| f.size * f.count).sum();
-            let bytes = source.bytes(header.data_at, stride * header.points as usize)?;
-            let mut at = 0;
-            let places: Vec<(usize, usize)> = header
-                .fields
-                .iter()
-                .map(|f| {
-                    let here = at;
-                    at += f.size * f.count;
-                    (here, stride)
-                })
-                .collect();
-            fill(&header, &bytes, &places, packed, first_packed, &roles)
+            let bytes = source.bytes(header.data_at, record_bytes(&header) * header.points as usize)?;
+            fill(&header, &bytes, &record_places(&header), packed, first_packed, &roles)
         }
         Data::Compressed => {
             let bytes = decompress(source, &header)?;
@@ -139,6 +142,49 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
         scan.set_stations(vec![Station { name: "viewpoint".into(), position_in_local: header.viewpoint }], vec![0; n]);
     }
     Ok(scan.relative(origin))
+}
+
+fn record_bytes(header: &Header) -> usize {
+    header.fields.iter().map(|f| f.size * f.count).sum()
+}
+
+/// First byte of each field in records that follow one another, and the length of a record.
+fn record_places(header: &Header) -> Vec<(usize, usize)> {
+    let stride = record_bytes(header);
+    let mut at = 0;
+    let place = |f: &Field| {
+        let here = at;
+        at += f.size * f.count;
+        (here, stride)
+    };
+    header.fields.iter().map(place).collect()
+}
+
+/// Text as the binary records that it would be: vectors and colours packed into the bits of a number need the bits.
+fn records_of_text(source: &SourceBytes, header: &Header) -> Result<Vec<u8>, Error> {
+    let text = source.up_to(header.data_at, usize::MAX)?;
+    let text = String::from_utf8_lossy(&text);
+    let bad = |cause: String| Error::bad(source.path(), cause, COPY_AGAIN);
+    let mut bytes = Vec::new();
+    let mut rows = 0;
+    for (number, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
+        if rows == header.points {
+            break;
+        }
+        let at_line = |what: &str| bad(format!("line {}: {what}", header.lines + 1 + number as u64));
+        let mut words = line.split_whitespace();
+        for field in &header.fields {
+            for _ in 0..field.count {
+                let word = words.next().ok_or_else(|| at_line("fewer numbers than the fields need"))?;
+                field.put(word, &mut bytes).ok_or_else(|| at_line(&format!("'{word}' is not a number")))?;
+            }
+        }
+        rows += 1;
+    }
+    if rows < header.points {
+        return Err(bad(format!("its header promises {} points, but {rows} follow", header.points)));
+    }
+    Ok(bytes)
 }
 
 /// Fills a table from fields that lie at `place + row * stride`.

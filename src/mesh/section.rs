@@ -760,6 +760,37 @@ mod tests {
     }
 
     #[test]
+    fn the_grid_is_nearly_the_delaunay_triangulation_of_its_vertices() {
+        use spade::{DelaunayTriangulation, Point2, Triangulation};
+        let (mesh, _) = mesh_of(&tube(120_000, |_, _| RADIUS), &OPTIONS);
+        let plane: Vec<Point2<f64>> =
+            mesh.vertices().iter().map(|v| Point2::new(v.x, RADIUS * (-v.y).atan2(v.z))).collect();
+        // Away from the portals and from the invert, where the plane has a border and the tube has none.
+        let inner = |v: u32| {
+            let p = plane[v as usize];
+            p.y.abs() < 0.9 * PI * RADIUS && (0.3..LENGTH - 0.3).contains(&p.x)
+        };
+        let delaunay = DelaunayTriangulation::<Point2<f64>>::bulk_load_stable(plane.clone()).unwrap();
+        let mut expected: Vec<[u32; 2]> = delaunay
+            .undirected_edges()
+            .map(|e| {
+                let [a, b] = e.vertices().map(|v| v.fix().index() as u32);
+                [a.min(b), a.max(b)]
+            })
+            .collect();
+        expected.sort_unstable();
+        let edges: Vec<[u32; 2]> = mesh
+            .faces()
+            .iter()
+            .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+            .filter(|&[a, b]| a < b && inner(a) && inner(b))
+            .collect();
+        let same = edges.iter().filter(|e| expected.binary_search(e).is_ok()).count();
+        let share = same as f64 / edges.len() as f64;
+        assert!(edges.len() > 20_000 && share > 0.95, "{share} of {}", edges.len());
+    }
+
+    #[test]
     fn noise_is_averaged_and_outliers_leave_no_spike() {
         let mut points = tube(240_000, |s, a| RADIUS + 0.03 * (3.0 * a).cos() * s.sin());
         let truth = |v: &Vec3| RADIUS + 0.03 * (3.0 * (-v.y).atan2(v.z)).cos() * v.x.sin();

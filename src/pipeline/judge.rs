@@ -351,7 +351,8 @@ mod tests {
     #[test]
     fn the_stations_that_disagree_most_are_judged_and_named() {
         let pair = |a: &str, b: &str, median: f64| json!({ "stations": [a, b], "median_m": median, "points": 900 });
-        let report = json!({ "ingest": { "overlaps": [pair("north", "middle", 0.003), pair("middle", "south", 0.031)] } });
+        let report =
+            json!({ "ingest": { "overlaps": [pair("north", "middle", 0.003), pair("middle", "south", 0.031)] } });
         let residual = check(&report, "station_residual_m");
         assert_eq!((residual.status, residual.value), (Status::Warn, Some(0.031)));
         assert!(residual.message.contains("'middle' and 'south'"), "{}", residual.message);

@@ -345,7 +345,7 @@ fn three_sets(tunnel: &Tunnel, seed: u64) -> Vec<Fracture> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::topology::{boundary_loops, components, twins};
+    use crate::mesh::topology::{boundary_loops, components};
     use std::f64::consts::PI;
 
     fn tunnels() -> Vec<Tunnel> {

@@ -320,3 +320,35 @@ fn residuals_between_stations_and_points_that_a_pose_moves() {
         assert!((p - q).amax() < 1e-4, "{p} {q}");
     }
 }
+
+#[test]
+fn pcd_text_with_packed_colours_and_vectors() {
+    let text = "VERSION .7\nFIELDS x y z rgb normal\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 1 1 1 1 3\nWIDTH 2\nHEIGHT 1\n\
+                POINTS 2\nDATA ascii\n1 2 3 2.3418052e-38 0 0 1\nnan 5 6 0 0 0 1\n";
+    let (cloud, summary) = scan("a.pcd", text.as_bytes());
+    // The bits of that number are 0x00ff0000.
+    assert_eq!(cloud.attributes().colors.as_deref(), Some(&[[65535, 0, 0]][..]));
+    assert_eq!(summary.files[0].dropped, 1);
+    let unsigned = text.replacen("TYPE F F F F F", "TYPE F F F U F", 1).replace("2.3418052e-38", "16711680");
+    assert_eq!(scan("a.pcd", unsigned.as_bytes()).0.attributes().colors, cloud.attributes().colors);
+    let error = read_bytes("a.pcd", text.replace("6 0 0 0 1\n", "6\n").as_bytes(), &Settings::default());
+    assert!(error.unwrap_err().to_string().contains("line 11: fewer numbers"));
+}
+
+#[test]
+fn mesh_dialects() {
+    let continued = mesh("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 \\\n3\n").unwrap().0;
+    assert_eq!(continued.faces, [[0, 1, 2]]);
+    let bare = mesh("a.off", b"3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n").unwrap().0;
+    assert_eq!((bare.vertices, bare.faces), (continued.vertices, continued.faces));
+    let upper =
+        b"SOLID A\nFACET NORMAL 0 0 1\nOUTER LOOP\nVERTEX 0 0 0\nVERTEX 1 0 0\nVERTEX 0 1 0\nENDLOOP\nENDFACET\n";
+    assert_eq!(mesh("a.stl", upper).unwrap().0.faces.len(), 1);
+    let mut binary = vec![b' '; 80];
+    binary.extend_from_slice(&1u32.to_le_bytes());
+    binary.extend_from_slice(&[0; 12]);
+    [0.0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0].iter().for_each(|c| binary.extend_from_slice(&c.to_le_bytes()));
+    binary.extend_from_slice(&[0; 5]);
+    let (read, summary) = mesh("a.stl", &binary).unwrap();
+    assert_eq!((read.faces.len(), summary.warnings[0].code.as_str()), (1, "trailing-bytes"));
+}
