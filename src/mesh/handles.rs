@@ -1,6 +1,6 @@
 //! Handles: bridges and tunnels of the surface that no flat map can have, found as short loops and cut open.
 //!
-//! Use it on surfaces from [`super::implicit`] and on meshes from elsewhere, where rock that touches itself leaves arches of a
+//! Use it on surfaces from [`super::poisson`] and on meshes from elsewhere, where rock that touches itself leaves arches of a
 //! few faces. Every cut along a loop that does not part the surface takes one handle away.
 //!
 //! Method. With every border closed by a fan, the edges that are neither in a shortest-path tree of the vertices nor

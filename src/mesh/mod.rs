@@ -3,7 +3,7 @@
 pub mod reconstruct;
 pub mod openings;
 pub mod section;
-pub mod implicit;
+pub mod poisson;
 mod void_side;
 mod surface_nets;
 pub mod repair;

@@ -2,7 +2,7 @@
 
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
-use super::{Mesh, VertexId, implicit, repair, section, topology};
+use super::{Mesh, VertexId, poisson, repair, section, topology};
 use crate::axis::Axis;
 use crate::numeric::{Vec3, wrap_angle};
 use crate::segment::{Class, Segmentation};
@@ -30,15 +30,15 @@ pub enum Method {
     #[default]
     /// Depth over the unrolled mean section: tunnels, drifts, sewers, shafts.
     Section,
-    /// Zero surface of a local signed distance: caves, junctions, deep overhangs.
-    Implicit,
+    /// Screened Poisson surface, trimmed by its points: caves, junctions, deep overhangs.
+    Poisson,
 }
 
 /// How the surface is made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// `"section"` for tunnels, drifts, sewers and shafts, `"implicit"` to keep what hides behind itself; the section
+    /// `"section"` for tunnels, drifts, sewers and shafts, `"poisson"` to keep what hides behind itself; the section
     /// method warns when much does.
     pub method: Method,
     /// Distance between neighbouring vertices in metres; by default about one vertex for 1.5 points, but not finer than
@@ -77,7 +77,7 @@ impl Default for Settings {
 /// What was built, for the report.
 #[derive(Clone, Debug, Serialize)]
 pub struct Summary {
-    /// The method that was used: `section`, `implicit`, or `given` for a mesh from elsewhere.
+    /// The method that was used: `section`, `poisson`, or `given` for a mesh from elsewhere.
     pub method: &'static str,
     /// Why it was chosen.
     pub reason: String,
@@ -96,9 +96,9 @@ pub struct Summary {
     /// Numbers of the section method.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub section: Option<section::Summary>,
-    /// Numbers of the implicit method.
+    /// Numbers of the poisson method.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub implicit: Option<implicit::Summary>,
+    pub poisson: Option<poisson::Summary>,
     /// What was thinned.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub decimate: Option<decimate::Summary>,
@@ -147,9 +147,9 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         fill_behind_furniture_m: settings.fill_behind_furniture_m,
         side_openings: settings.side_openings,
     };
-    if settings.method == Method::Implicit {
-        let reason = "mesh.method = \"implicit\" was set".to_owned();
-        return by_distance(segmentation, axis, settings, &options, reason);
+    if settings.method == Method::Poisson {
+        let reason = "mesh.method = \"poisson\" was set".to_owned();
+        return by_poisson(segmentation, axis, settings, &options, reason);
     }
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
     let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
@@ -160,7 +160,7 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
             "multiple-depths",
             format!(
                 "{share:.1} % of the cells hold points at several distances from the axis; the section method keeps one; \
-                 mesh.method = \"implicit\" keeps all"
+                 mesh.method = \"poisson\" keeps all"
             ),
         ));
     }
@@ -170,7 +170,7 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
             "mostly-in-front",
             format!(
                 "{:.0} % of the points stand in front of the rest and were left out: the tunnel is not understood as a \
-                 section that runs along an axis; mesh.method = \"implicit\" keeps them",
+                 section that runs along an axis; mesh.method = \"poisson\" keeps them",
                 100.0 * front as f64 / (points + front) as f64
             ),
         ));
@@ -187,8 +187,8 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
     Ok((mesh, summary))
 }
 
-/// The implicit method, cut off at the wall line and repaired.
-fn by_distance(
+/// The poisson method, cut off at the wall line and repaired.
+fn by_poisson(
     segmentation: &Segmentation,
     axis: &Axis,
     settings: &Settings,
@@ -219,12 +219,6 @@ fn by_distance(
         .collect();
     let wall_line =
         (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
-    let implicit_options = implicit::Options {
-        spacing_m: settings.spacing_m,
-        max_gap_m: settings.max_gap_m,
-        fill_hole_m: settings.fill_hole_m,
-        perimeter_m: segmentation.section.mean_perimeter(),
-    };
     let walls: Vec<Vec3> = segmentation
         .coordinates
         .par_iter()
@@ -232,8 +226,15 @@ fn by_distance(
         .filter(|(_, k)| **k != Class::Noise)
         .map(|(c, _)| axis.point_at(c))
         .collect();
-    let (raw, implicit) = implicit::reconstruct(points, &walls, axis, &implicit_options);
+    let poisson_options = poisson::Options {
+        spacing_m: settings.spacing_m,
+        max_gap_m: settings.max_gap_m,
+        fill_hole_m: settings.fill_hole_m,
+        perimeter_m: segmentation.section.mean_perimeter(),
+    };
+    let (raw, poisson) = poisson::reconstruct(points, &walls, axis, &poisson_options);
     drop(walls);
+    warnings.extend(poisson.warning(settings.spacing_m));
     let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
     let mut openings = Vec::new();
     if let Some(line) = wall_line {
@@ -248,10 +249,10 @@ fn by_distance(
         return Err(Error::NoSurface { points: surface });
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("implicit", reason, &mesh, warnings);
+    let mut summary = describe("poisson", reason, &mesh, warnings);
     summary.decimate = thinned;
     summary.openings = openings;
-    summary.implicit = Some(implicit);
+    summary.poisson = Some(poisson);
     summary.repair = Some(repaired);
     Ok((mesh, summary))
 }
@@ -391,7 +392,7 @@ fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<War
         boundary_loops: topology::boundary_loops(mesh.faces(), twin).len(),
         openings: Vec::new(),
         section: None,
-        implicit: None,
+        poisson: None,
         decimate: None,
         repair: None,
         warnings,
@@ -459,7 +460,7 @@ mod tests {
     #[test]
     fn a_side_drift_is_cut_off_at_the_wall_line_and_told() {
         let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
-        for method in [Method::Section, Method::Implicit] {
+        for method in [Method::Section, Method::Poisson] {
             let (mesh, summary) =
                 reconstruct(&segmentation, &axis(), &Settings { method, ..Settings::default() }).unwrap();
             assert_eq!(summary.openings.len(), 1, "{method:?} {:?}", summary.openings);
@@ -468,7 +469,7 @@ mod tests {
             assert!((opening.width_m[0] - 1.6).abs() < 0.4 && (opening.seen_depth_m - 4.7).abs() < 0.6, "{opening:?}");
             assert!((Vec3::from(opening.ends_in_local[1]) - Vec3::new(10.0, 6.6, 0.0)).norm() < 0.5);
             assert!(mesh.vertices().iter().all(|v| v.y.hypot(v.z) < 2.35), "{method:?}: nothing behind the wall line");
-            // The implicit method may leave a sliver of the rim open besides.
+            // The poisson method may leave a sliver of the rim open besides.
             let most = if method == Method::Section { 3 } else { 5 };
             assert!((3..=most).contains(&summary.boundary_loops), "{method:?}: {}", summary.boundary_loops);
             assert!(summary.warnings.iter().any(|w| w.code == "side-openings"));

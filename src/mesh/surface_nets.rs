@@ -1,4 +1,4 @@
-//! Surface nets on a sparse grid: the zero surface of a signed distance, one vertex for each sheet in a cell.
+//! Surface nets on a sparse grid: the zero surface of a function, one vertex for each sheet in a cell.
 //!
 //! Reference: S. F. F. Gibson, "Constrained elastic surface nets", MICCAI 1998, doi:10.1007/BFb0056277 (vertex in the mean
 //! of the edge crossings); G. M. Nielson, "Dual marching cubes", IEEE Visualization 2004, doi:10.1109/VISUAL.2004.28 (a
@@ -20,13 +20,13 @@ pub(super) const SIDE: usize = 8;
 pub(super) const VOLUME: usize = SIDE * SIDE * SIDE;
 const NO_VERTEX: u32 = u32::MAX;
 
-/// A signed distance at the vertices of some blocks of a grid; NaN where it is not known.
+/// A function at the vertices of some blocks of a grid; NaN where it is not known.
 pub(super) struct Field {
     pub origin: Vec3,
     pub cell_m: f64,
     /// Block coordinates, ascending in (z, y, x).
     pub blocks: Vec<[i32; 3]>,
-    /// Values in metres, positive in the void; `x` fastest. Single precision: distances of at most a few cells.
+    /// Values, positive in the void; `x` fastest. Single precision: only where they change sign inside a cell counts.
     pub values: Vec<[f32; VOLUME]>,
     number: HashMap<[i32; 3], u32>,
 }

@@ -41,7 +41,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "axis", version: 2, needs: &["clean"] },
     Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 2, needs: &["ingest", "clean", "axis"] },
-    Stage { name: "mesh", version: 3, needs: &["segment", "normals", "axis"] },
+    Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
@@ -54,7 +54,7 @@ pub const STAGES: &[Stage] = &[
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 2, needs: &["ingest"] },
-    Stage { name: "mesh", version: 2, needs: &["ingest", "axis"] },
+    Stage { name: "mesh", version: 3, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 2, needs: &["cut", "axis"] },
     Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
