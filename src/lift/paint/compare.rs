@@ -1,6 +1,6 @@
 //! The edited picture beside the pictures of the map: which of them was painted on, and where it differs.
 
-use super::{Base, Error, MAX_TOLERANCE, NEW_COLOR, NOISE_FACTOR, SAME, rgb};
+use super::{Base, Error, MAX_TOLERANCE, NEW_COLOR, NOISE_FACTOR, SAME, SWING, rgb};
 use crate::map::{Picture, Placement, color_distance};
 use crate::numeric::{Vec2, statistics};
 use rayon::prelude::*;
@@ -9,14 +9,14 @@ use rayon::prelude::*;
 const BASE_SHARE: f64 = 0.4;
 /// Median difference from the base, at most.
 const MAX_MEDIAN: f64 = 30.0;
-/// Filters that sharpen when they resize swing beyond the colours around, by this share of the contrast within this many
-/// half pixels of the edited picture.
-const RINGING: f64 = 0.12;
+/// Filters that sharpen swing by a share of the contrast within this many half pixels of the edited picture.
 const RINGING_REACH: f64 = 5.0;
 /// The colours of pixels so near to the edge of the surface may be mixed with what is behind it.
 const EDGE_PX: f64 = 3.0;
 /// JPEG mixes colours over so many pixels.
 const JPEG_SPREAD_PX: f64 = 2.0;
+/// Channels of an even base differ by so many grey levels.
+const EVEN: u8 = 64;
 /// Pixels looked at to find the base.
 const BASE_SAMPLES: usize = 200_000;
 /// Shapes may differ by this many pixels (rounding when a picture was resized).
@@ -42,6 +42,18 @@ pub(super) struct Seen {
     pub(super) base: [u8; 3],
     /// Whether the surface ends near: programs mix its colours with what lies behind transparency.
     pub(super) edge: bool,
+    /// Whether the base is nearly even around the pixel: no edge of its own is resized or compressed there.
+    pub(super) even: bool,
+}
+
+/// Where a pixel of the edited picture lies between the colours of the base.
+struct Difference {
+    /// Mean colour of the base under the pixel.
+    mean: [u8; 3],
+    /// Distance of the edited colour from the colours around.
+    from_base: f64,
+    /// Greatest difference of a channel among the colours around.
+    contrast: u8,
 }
 
 /// Compares the edited picture with pictures of the map, pixel by pixel of the edited one.
@@ -75,7 +87,7 @@ impl Sampler<'_> {
 
     /// Mean colour of the base under a pixel, and how far the edited colour is from the colours around it. `None` beside
     /// the surface.
-    fn difference(&self, x: usize, y: usize, base: &Picture) -> Option<([u8; 3], f64)> {
+    fn difference(&self, x: usize, y: usize, base: &Picture) -> Option<Difference> {
         let (bx, by) = self.map_pixel(x, y, base)?;
         if base.rgba[4 * (by * base.width + bx) + 3] < 128 {
             return None;
@@ -83,7 +95,8 @@ impl Sampler<'_> {
         let color = rgb(self.edited, y * self.edited.width + x);
         let own = rgb(base, by * base.width + bx);
         if !self.is_resized() && !self.lossy {
-            return Some((own, f64::from(color_distance(own, color)).sqrt()));
+            let from_base = f64::from(color_distance(own, color)).sqrt();
+            return Some(Difference { mean: own, from_base, contrast: 0 });
         }
         // In a resized picture, and in a JPEG, the colour may be any mixture of the pixels around, and sharpening filters swing beyond it
         // by a share of the contrast farther around.
@@ -118,11 +131,13 @@ impl Sampler<'_> {
         }
         let mean = if weight > 0.0 { sum.map(|s| (s / weight).round() as u8) } else { own };
         let beyond = |k: usize| {
-            let swing = RINGING * f64::from(most[k] - least[k]);
+            let swing = SWING * f64::from(most[k] - least[k]);
             let over = low[k].saturating_sub(color[k]).max(color[k].saturating_sub(high[k]));
             (f64::from(over) - swing).max(0.0)
         };
-        Some((mean, (0..3).map(|k| beyond(k).powi(2)).sum::<f64>().sqrt()))
+        let from_base = (0..3).map(|k| beyond(k).powi(2)).sum::<f64>().sqrt();
+        let contrast = (0..3).map(|k| high[k].saturating_sub(low[k])).max().unwrap_or(0);
+        Some(Difference { mean, from_base, contrast })
     }
 
     /// Whether the base has no surface within a few pixels.
@@ -143,28 +158,28 @@ impl Sampler<'_> {
         let width = self.edited.width;
         let state = |i: usize| {
             let (x, y) = (i % width, i / width);
-            let nothing = Seen { state: State::NoSurface, base: [0; 3], edge: false };
+            let nothing = Seen { state: State::NoSurface, base: [0; 3], edge: false, even: false };
             let on_labels =
                 self.map_pixel(x, y, labels).is_some_and(|(c, r)| labels.rgba[4 * (r * labels.width + c) + 3] >= 128);
             if !on_labels {
                 return nothing;
             }
             let edge = self.is_near_edge(x, y, base);
-            let Some((mean, difference)) = self.difference(x, y, base) else {
+            let Some(difference) = self.difference(x, y, base) else {
                 // Surface without a value in this picture (such as colour): what is opaque there was painted.
                 let opaque =
                     self.edited.rgba[4 * i + 3] >= 128 && difference_from_grey(rgb(self.edited, i)) > NEW_COLOR;
                 let state = if opaque { State::Painted } else { State::Same };
-                return Seen { state, base: [255; 3], edge };
+                return Seen { state, base: [255; 3], edge, even: true };
             };
             let state = if self.edited.rgba[4 * i + 3] < 128 {
                 State::Erased
-            } else if difference > tolerance {
+            } else if difference.from_base > tolerance {
                 State::Painted
             } else {
                 State::Same
             };
-            Seen { state, base: mean, edge }
+            Seen { state, base: difference.mean, edge, even: difference.contrast <= EVEN }
         };
         (0..width * self.edited.height).into_par_iter().map(state).collect()
     }
@@ -202,7 +217,7 @@ pub(super) fn find_base<'a>(sample: &Sampler, bases: &'a [Base]) -> Result<(&'a 
         let mut differences: Vec<f64> = (0..pixels)
             .step_by(step)
             .filter(|&i| sample.edited.rgba[4 * i + 3] >= 128)
-            .filter_map(|i| sample.difference(i % width, i / width, &base.picture).map(|d| d.1))
+            .filter_map(|i| sample.difference(i % width, i / width, &base.picture).map(|d| d.from_base))
             .collect();
         let Some(median) = statistics::median(&mut differences) else { continue };
         let tolerance = (SAME + NOISE_FACTOR * median.min(MAX_MEDIAN)).min(MAX_TOLERANCE);

@@ -31,7 +31,7 @@ mod tests;
 use self::compare::{Sampler, State, find_base, whole_map};
 use self::mixture::{Found, Painted, drop_isolated};
 use self::new_classes::find_new_classes;
-use self::on_the_map::on_the_map;
+use self::on_the_map::{LabelsBefore, Shares, on_the_map};
 use super::Error;
 use super::label_map::LabelMap;
 use crate::cloud::Label;
@@ -50,9 +50,11 @@ const NEAR_PX: usize = 3;
 /// Painted share of a certain pixel, in a picture of the same size and in a resized one.
 const CERTAIN_SHARE: f64 = 0.7;
 const CERTAIN_SHARE_RESIZED: f64 = 0.45;
-
-/// Share of painted pixels that may stay without a class, in a lossless and in a noisy picture.
+/// Filters that sharpen when they resize swing beyond the colours around by this share of the contrast.
+const SWING: f64 = 0.12;
+/// Share of painted pixels that may stay without a class, in a lossless, a resized and a noisy picture.
 const AMBIGUOUS_SHARE: f64 = 0.02;
+const AMBIGUOUS_SHARE_RESIZED: f64 = 0.05;
 const AMBIGUOUS_SHARE_NOISY: f64 = 0.25;
 /// A new colour must cover this many pixels to be a class; more in noisy pictures.
 const NEW_CLASS_PX: usize = 9;
@@ -100,6 +102,8 @@ pub struct Recognised {
     pub smoothed_px: usize,
     /// Painted pixels without a class; they stay what they were.
     pub ambiguous_px: usize,
+    /// Pixels of the map on the border of two painted classes, which could be either; they stay what they were.
+    pub undecided_px: usize,
     /// Pixels of the map that are transparent in the edited picture: erased, so they are unlabelled now.
     pub erased_px: usize,
 }
@@ -134,6 +138,7 @@ pub fn recognise(
         near: (NEAR_PX as f64 / sample.scale().min(1.0)).ceil() as usize,
         mixed: noisy || sample.is_resized(),
         lossy: edited.lossy,
+        swing: if sample.is_resized() { SWING } else { 0.0 },
     };
     let seen = sample.compare(&base.picture, labels, rules.tolerance);
     let painted_px = seen.iter().filter(|s| s.state == State::Painted).count();
@@ -152,14 +157,18 @@ pub fn recognise(
     if noisy {
         drop_isolated(&mut certain, &index, width, height);
     }
-    // Share of each pixel that is painted, and with which class.
-    let mut paint: Vec<(u16, f32)> = vec![(0, 0.0); seen.len()];
+    if rules.mixed {
+        let doubtful: Vec<usize> = index.par_iter().copied().filter(|&i| painted.is_doubtful(i, &certain)).collect();
+        doubtful.into_iter().for_each(|i| certain[i] = None);
+    }
+    // Share of each pixel that is painted, and with which classes.
+    let mut paint: Vec<Shares> = vec![[(0, 0.0); 2]; seen.len()];
     let (mut smoothed_px, mut ambiguous, mut example) = (0, 0, 0);
     let found: Vec<Found> = index.par_iter().map(|&i| painted.share(i, &certain)).collect();
     for (&i, found) in index.iter().zip(found) {
         match found {
-            Found::Paint(class, share) => {
-                paint[i] = (class, share as f32);
+            Found::Paint(shares) => {
+                paint[i] = shares.map(|(class, share)| (class, share as f32));
                 smoothed_px += usize::from(certain[i].is_none());
             }
             Found::Noise => {}
@@ -171,7 +180,11 @@ pub fn recognise(
             }
         }
     }
-    let limit = if noisy { AMBIGUOUS_SHARE_NOISY } else { AMBIGUOUS_SHARE };
+    let limit = match (noisy, sample.is_resized()) {
+        (true, _) => AMBIGUOUS_SHARE_NOISY,
+        (false, true) => AMBIGUOUS_SHARE_RESIZED,
+        (false, false) => AMBIGUOUS_SHARE,
+    };
     let few = if noisy { NEW_CLASS_PX_NOISY } else { NEW_CLASS_PX };
     if ambiguous as f64 > limit * painted_px as f64 && ambiguous > few {
         let [r, g, b] = rgb(&edited.picture, example);
@@ -183,7 +196,8 @@ pub fn recognise(
             row: example / width,
         });
     }
-    let map = on_the_map(&sample, labels, palette, &classes, &seen, &paint);
+    let before = LabelsBefore { picture: labels, palette };
+    let (map, undecided_px) = on_the_map(&sample, &before, &classes, &seen, &paint, rules.mixed);
     Ok(Recognised {
         map,
         base: base.name.clone(),
@@ -193,6 +207,7 @@ pub fn recognise(
         painted_px,
         smoothed_px,
         ambiguous_px: ambiguous,
+        undecided_px,
         erased_px: (0..width * height).filter(|&i| seen[i].state == State::Erased).count(),
     })
 }
@@ -211,6 +226,8 @@ struct Rules {
     mixed: bool,
     /// Whether brightness and colour were spread differently (JPEG).
     lossy: bool,
+    /// How far beyond both colours of a mixture a colour may be, as a share of their difference.
+    swing: f64,
 }
 
 fn rgb(picture: &Picture, i: usize) -> [u8; 3] {

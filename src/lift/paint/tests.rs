@@ -243,3 +243,42 @@ fn what_was_erased_is_unlabelled() {
     let found = recognise(&edited(picture), &bases, placement, &classes).unwrap();
     assert_eq!((found.erased_px, found.map.labels[55 * W + 45], found.map.labels[65 * W + 45]), (200, 0, 1));
 }
+
+/// Pure red and a strong yellow are nearly the colours of two classes; fills of them, and where they touch, are neither
+/// those classes nor a third one.
+#[test]
+fn new_colours_like_those_of_classes_stay_apart_in_every_file() {
+    use image::imageops::FilterType;
+    let (bases, _, placement) = bases();
+    let classes = palette(1..=9);
+    let new = [[255, 0, 0], [250, 230, 0]];
+    let mut painted = bases[1].picture.clone();
+    let mut truth = vec![None; W * H];
+    for y in 20..90 {
+        for x in 100..200 {
+            let which = usize::from(x >= 150);
+            painted.rgba[4 * (y * W + x)..4 * (y * W + x) + 3].copy_from_slice(&new[which]);
+            truth[y * W + x] = Some(which);
+        }
+    }
+    for (name, picture, lossy) in [
+        ("half", resized(&painted, 0.5, FilterType::CatmullRom), false),
+        ("double", resized(&painted, 2.0, FilterType::CatmullRom), false),
+        ("jpeg", as_jpeg(&painted, 85), true),
+    ] {
+        let found = recognise(&Edited { picture, placement: None, lossy }, &bases, placement, &classes)
+            .unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(found.new_classes.len(), 2, "{name}: {:?}", found.classes);
+        let color = |label: Label| found.classes.iter().find(|c| c.value == label).unwrap().color;
+        let (mut right, mut wrong) = (0, 0);
+        for (&label, truth) in found.map.labels.iter().zip(&truth) {
+            let Some(truth) = *truth else { continue };
+            if found.new_classes.contains(&label) && distance(color(label), new[truth]) < NEW_COLOR {
+                right += 1;
+            } else if label != 0 {
+                wrong += 1;
+            }
+        }
+        assert!(right >= 6_700 && wrong == 0, "{name}: {right} of 7000 right, {wrong} wrong");
+    }
+}
