@@ -223,33 +223,50 @@ fn judge(drawn: &Drawn) -> serde_json::Value {
     report
 }
 
-/// Trace length of all planes in a round tunnel of radius 2.3 m, by a fine polygon around the section in closed form,
-/// counted where the surface was observed: the statistics are of observed surface.
-fn analytic_trace_length(drawn: &Drawn, case: &Case) -> f64 {
+/// Trace length of each plane in a round tunnel of radius 2.3 m, in closed form, counted where the surface was observed: the
+/// statistics are of observed surface. The curve is followed around the section, or along the axis where the plane is
+/// parallel to it (or nearly), because there it has one angle for each chainage and not one chainage for each angle.
+fn analytic_trace_lengths(drawn: &Drawn, case: &Case) -> Vec<f64> {
+    const RADIUS_M: f64 = 2.3;
+    const STEPS: u32 = 6_000;
     let tunnel = case.recipe.tunnel().unwrap();
     let (from, to) = (tunnel.frame_at(0.0), tunnel.frame_at(LENGTH_M));
     let forward = (to.origin - from.origin).normalize();
     let origin = drawn.frame.local_from_scan(&(from.origin + case.recipe.origin_in_scan));
     let mesh = drawn.chart.strip().mesh();
     let anchoring = Anchoring::of(mesh);
-    let steps = 6_000;
-    let mut length = 0.0;
-    for (normal, through, _) in &drawn.planes {
-        let mut before: Option<Vec3> = None;
-        for i in 0..=steps {
-            let a = std::f64::consts::TAU * f64::from(i) / f64::from(steps);
-            let rim = origin + (from.left * a.sin() + from.up * a.cos()) * 2.3;
-            let here = rim + forward * (normal.dot(&(through - rim)) / normal.dot(&forward));
-            if let Some(before) = before
-                && let Some((foot, _)) = anchoring.foot(&((before + here) / 2.0), 0.05)
-                && mesh.observed()[foot.face as usize]
-            {
-                length += (here - before).norm();
-            }
-            before = Some(here);
+    let rim = |a: f64| origin + (from.left * a.sin() + from.up * a.cos()) * RADIUS_M;
+    let observed_length = |curve: &[Option<Vec3>]| -> f64 {
+        let pieces = curve.windows(2).filter_map(|w| Some((w[0]?, w[1]?)));
+        let seen = |a: &Vec3, b: &Vec3| {
+            let foot = anchoring.foot(&((a + b) / 2.0), 0.05);
+            foot.is_some_and(|(foot, _)| mesh.observed()[foot.face as usize])
+        };
+        pieces.filter(|(a, b)| seen(a, b)).map(|(a, b)| (b - a).norm()).sum()
+    };
+    let length = |(normal, through, _): &(Vec3, Vec3, usize)| {
+        let slope = normal.dot(&forward);
+        if slope.abs() > 0.02 {
+            let around = |i: u32| {
+                let p = rim(std::f64::consts::TAU * f64::from(i) / f64::from(STEPS));
+                Some(p + forward * (normal.dot(&(through - p)) / slope))
+            };
+            return observed_length(&(0..=STEPS).map(around).collect::<Vec<_>>());
         }
-    }
-    length
+        // normal . (left sin a + up cos a) = amplitude cos(a - phase) has two solutions, on both sides of the phase.
+        let (s, c) = (normal.dot(&from.left), normal.dot(&from.up));
+        let (amplitude, phase) = (s.hypot(c) * RADIUS_M, s.atan2(c));
+        let along = |side: f64| {
+            let at = |i: u32| {
+                let on_axis = forward * (LENGTH_M * f64::from(i) / f64::from(STEPS));
+                let cosine = normal.dot(&(through - origin - on_axis)) / amplitude;
+                (cosine.abs() < 1.0).then(|| rim(phase + side * cosine.acos()) + on_axis)
+            };
+            observed_length(&(0..=STEPS).map(at).collect::<Vec<_>>())
+        };
+        along(1.0) + along(-1.0)
+    };
+    drawn.planes.iter().map(length).collect()
 }
 
 fn check(course: Course, azimuth: f64) {
@@ -259,14 +276,14 @@ fn check(course: Course, azimuth: f64) {
     let mesh = drawn.chart.strip().mesh();
     let observed = (0..mesh.faces().len() as u32).filter(|&f| mesh.observed()[f as usize]);
     let area: f64 = observed.map(|f| mesh.double_area_vector(f).norm() / 2.0).sum();
-    let truth = analytic_trace_length(&drawn, &case) / area;
+    let truth = analytic_trace_lengths(&drawn, &case).iter().sum::<f64>() / area;
     let found = report["statistics"]["all"]["p21_m_per_m2"].as_f64().unwrap();
     assert!((found / truth - 1.0).abs() < 0.03, "P21 is {found}, should be {truth}");
 }
 
 #[test]
-#[ignore = "the intensity P21 comes out 13 % too high here, as yet unexplained; orientations and sets hold"]
 fn tunnel_to_the_north() {
+    // One plane of the third set dips due west: it runs exactly along this tunnel.
     check(Course::Straight, 0.0);
 }
 

@@ -185,6 +185,10 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
     if found.ambiguous_px > 0 {
         let _ = write!(told, "; {} between the classes were left as they were", found.ambiguous_px);
     }
+    if found.undecided_px > 0 {
+        let _ =
+            write!(told, "; {} pixels of the map where two classes touch were left as they were", found.undecided_px);
+    }
     for entry in found.classes.iter().filter(|e| found.new_classes.contains(&e.value)) {
         let [r, g, b] = entry.color;
         let _ = write!(told, "\nnew class {} for the colour #{r:02x}{g:02x}{b:02x}", entry.value);
