@@ -36,6 +36,15 @@ const SIGMA_ANGLE: f64 = 3.0 * PI / 180.0;
 const REJECT_SHARE: f64 = 0.2;
 /// Rows looked at on both sides for that median: 8 m of a rail tunnel, so that 7 m beyond a portal are outvoted.
 const REJECT_ROWS: usize = 16;
+/// Rows looked at on both sides for the walls beside a side room: four mean radii, so that rooms up to twice as wide as the
+/// tunnel are outvoted.
+const ROOM_ROWS: usize = 32;
+/// A side room takes no more than this share of the directions around the axis; what does is a chamber of the tunnel.
+const ROOM_DIRECTIONS: f64 = 0.45;
+/// The cheeks of a side room: within two rows the wall steps back by this share of the mean radius (50 degrees).
+const CHEEK_IN_RADII: f64 = 0.3;
+/// Share of its ends along the tunnel at which a side room has cheeks.
+const CHEEK_SHARE: f64 = 0.5;
 /// A row belongs to the tunnel when at least this share of its 10-degree sectors holds points.
 const MIN_SECTOR_SHARE: f64 = 0.25;
 
@@ -96,6 +105,7 @@ impl SectionField {
         let columns = COLUMNS / MEDIAN_COLUMNS;
         let (first, last) = tunnel_rows(&raw, rows, 0.0)?;
         let mut raw = raw[first * columns..(last + 1) * columns].to_vec();
+        reject_side_rooms(&mut raw, last - first + 1, mean_radius);
         reject_isolated(&mut raw, last - first + 1);
         // What was rejected at the ends lies outside the portals.
         let (inner_first, inner_last) = tunnel_rows(&raw, last - first + 1, PORTAL_SHARE)?;
@@ -327,29 +337,95 @@ fn tunnel_rows(raw: &[f64], rows: usize, typical: f64) -> Result<(usize, usize),
     }
 }
 
-/// Sets cells to NaN that lie far from the median of their surroundings along the tunnel: outliers, side openings, and
-/// what the scanner saw beyond the portals.
-fn reject_isolated(raw: &mut [f64], rows: usize) {
-    let reach = REJECT_ROWS;
+/// Median of each cell's surroundings along the tunnel, `reach` rows on both sides; NaN where nothing is known.
+fn medians_around(raw: &[f64], rows: usize, reach: usize) -> Vec<f64> {
     let columns = COLUMNS / MEDIAN_COLUMNS;
-    let before = raw.to_vec();
-    for row in 0..rows {
-        for k in 0..columns {
-            let value = before[row * columns + k];
-            if value.is_nan() {
-                continue;
+    (0..rows * columns)
+        .into_par_iter()
+        .map(|cell| {
+            let (row, k) = (cell / columns, cell % columns);
+            if raw[cell].is_nan() {
+                return f64::NAN;
             }
             let mut around: Vec<f64> = (row.saturating_sub(reach)..(row + reach + 1).min(rows))
                 .flat_map(|i| (0..3).map(move |d| i * columns + (k + columns + d - 1) % columns))
-                .map(|c| before[c])
+                .map(|c| raw[c])
                 .filter(|v| !v.is_nan())
                 .collect();
-            let middle = statistics::median(&mut around).unwrap_or(value);
-            if (value - middle).abs() > REJECT_SHARE * middle {
-                raw[row * columns + k] = f64::NAN;
-            }
+            statistics::median(&mut around).unwrap_or(f64::NAN)
+        })
+        .collect()
+}
+
+/// Sets cells to NaN that lie far from the median of their surroundings along the tunnel: outliers, side openings, and
+/// what the scanner saw beyond the portals.
+fn reject_isolated(raw: &mut [f64], rows: usize) {
+    let medians = medians_around(raw, rows, REJECT_ROWS);
+    for (value, middle) in raw.iter_mut().zip(medians) {
+        if (*value - middle).abs() > REJECT_SHARE * middle {
+            *value = f64::NAN;
         }
     }
+}
+
+/// Sets the cells of side rooms and crosscuts to NaN, which are too long for [`reject_isolated`]: connected cells far
+/// behind the walls before and after them, on one side of the tunnel only, whose wall steps back at once. Where a cave
+/// widens into an alcove the wall does so by and by, and a chamber widens all around.
+fn reject_side_rooms(raw: &mut [f64], rows: usize, mean_radius: f64) {
+    let columns = COLUMNS / MEDIAN_COLUMNS;
+    let medians = medians_around(raw, rows, ROOM_ROWS);
+    let mut far: Vec<bool> = raw.iter().zip(&medians).map(|(r, m)| *r > (1.0 + REJECT_SHARE) * m).collect();
+    for start in 0..far.len() {
+        if !std::mem::replace(&mut far[start], false) {
+            continue;
+        }
+        let mut room = vec![start];
+        let mut done = 0;
+        while done < room.len() {
+            let (i, k) = (room[done] / columns, room[done] % columns);
+            done += 1;
+            // Shadows are narrow; over a gap of one cell a room goes on.
+            for row in i.saturating_sub(2)..(i + 3).min(rows) {
+                for d in 0..5 {
+                    let cell = row * columns + (k + columns + d - 2) % columns;
+                    if std::mem::replace(&mut far[cell], false) {
+                        room.push(cell);
+                    }
+                }
+            }
+        }
+        let mut directions = vec![false; columns];
+        room.iter().for_each(|cell| directions[cell % columns] = true);
+        let directions = directions.iter().filter(|d| **d).count();
+        if directions as f64 <= ROOM_DIRECTIONS * columns as f64
+            && has_cheeks(raw, rows, &mut room, CHEEK_IN_RADII * mean_radius)
+        {
+            room.iter().for_each(|&cell| raw[cell] = f64::NAN);
+        }
+    }
+}
+
+/// Whether the radius jumps by `step_m` within two rows at enough of the ends of a room along the tunnel.
+fn has_cheeks(raw: &[f64], rows: usize, room: &mut [usize], step_m: f64) -> bool {
+    let columns = COLUMNS / MEDIAN_COLUMNS;
+    room.sort_unstable_by_key(|cell| (cell % columns, cell / columns));
+    let (mut ends, mut cheeks) = (0_u32, 0_u32);
+    let mut judge = |row: usize, column: usize, outwards: isize| {
+        let at = |steps: isize| {
+            let i = row as isize + steps * outwards;
+            (0..rows as isize).contains(&i).then(|| raw[i as usize * columns + column]).filter(|r| !r.is_nan())
+        };
+        let Some(outside) = at(1).or(at(2)) else { return };
+        let inside = at(0).unwrap_or(outside).max(at(-1).unwrap_or(outside));
+        ends += 1;
+        cheeks += u32::from(inside - outside > step_m);
+    };
+    for of_column in room.chunk_by(|a, b| a % columns == b % columns) {
+        let column = of_column[0] % columns;
+        judge(of_column[0] / columns, column, -1);
+        judge(of_column[of_column.len() - 1] / columns, column, 1);
+    }
+    ends > 0 && f64::from(cheeks) >= CHEEK_SHARE * f64::from(ends)
 }
 
 /// Normalised convolution from coarse to fine; returns the radius and whether the cell had points, `rows x COLUMNS`.
@@ -488,6 +564,38 @@ mod tests {
         let flat: Vec<_> = (0..999).map(|i| AxisCoordinates { chainage: f64::from(i), right: 3.0, up: 0.1 }).collect();
         assert!(matches!(SectionField::estimate(&flat, 0.0), Err(Error::NotSurrounded { .. })));
         assert_eq!(SectionField::estimate(&[], 0.0).unwrap_err(), Error::Empty);
+    }
+
+    /// Points of a tunnel of 1.6 m radius whose radius is `r(chainage, angle)` where that is more.
+    fn widened(r: impl Fn(f64, f64) -> f64) -> SectionField {
+        let points: Vec<AxisCoordinates> = points(40.0, |_| 1.6)
+            .iter()
+            .map(|c| AxisCoordinates::from_polar(c.chainage, c.angle(), r(c.chainage, c.angle()).max(1.6)))
+            .collect();
+        SectionField::estimate(&points, 0.0).unwrap()
+    }
+
+    #[test]
+    fn a_room_wider_than_the_tunnel_does_not_dent_the_section() {
+        // A room of 4.4 m on the left, two thirds of the wall high, 6 m deep.
+        let left = |s: f64, a: f64| (s - 20.0).abs() < 2.2 && (-2.4..-0.7).contains(&a);
+        let field = widened(|s, a| if left(s, a) { (6.0 / a.sin().abs()).min(7.0) } else { 0.0 });
+        for s in [17.0, 18.5, 20.0, 21.9, 23.0] {
+            for a in [-2.0, -1.57, -1.0, 0.0, 1.57] {
+                assert!((field.radius(s, a) - 1.6).abs() < 0.15, "{s} {a}: {}", field.radius(s, a));
+            }
+        }
+    }
+
+    #[test]
+    fn a_cave_that_widens_keeps_its_shape() {
+        let swell = |s: f64| 1.6 + 1.4 * (-((s - 20.0) / 2.5).powi(2)).exp();
+        // All around, and on one side.
+        let chamber = widened(|s, _| swell(s));
+        let alcove = widened(|s, a| if (-2.4..-0.7).contains(&a) { swell(s) } else { 0.0 });
+        for field in [chamber, alcove] {
+            assert!(field.radius(20.0, -1.57) > 2.7, "{}", field.radius(20.0, -1.57));
+        }
     }
 
     #[test]
