@@ -22,6 +22,7 @@ pub mod handles;
 pub mod lscm;
 pub mod method;
 mod opening;
+mod patch_embedding;
 mod poisson;
 mod quasi_newton;
 pub mod readability;
