@@ -25,6 +25,7 @@ pub(super) enum State {
 }
 
 /// A dense grid over the scan, padded by one empty cell on every side.
+#[derive(Clone)]
 pub(super) struct Grid {
     pub cell_m: f64,
     origin: Vec3,
@@ -41,6 +42,30 @@ pub(super) struct EnclosedVoid {
     pub enclosed_share: f64,
     /// Largest distance from a cell of it to the nearest occupied cell, metres.
     pub clearance_m: f64,
+}
+
+impl EnclosedVoid {
+    /// The void without what is no more than two cells thin: the inside of a wall that was scanned from both sides, and
+    /// leaks where the scan of a wall has holes. `None` when nothing is left.
+    pub fn without_thin_parts(&self) -> Option<Self> {
+        let grid = &self.grid;
+        let is_core: Vec<bool> = self
+            .cells
+            .par_iter()
+            .with_min_len(1024)
+            .map(|&cell| grid.neighbours(cell, 26).all(|(n, _)| grid.states[n] != State::Occupied))
+            .collect();
+        let core = |cell: usize| self.cells.binary_search(&cell).is_ok_and(|i| is_core[i]);
+        let mut thicker = grid.clone();
+        for (i, &cell) in self.cells.iter().enumerate() {
+            if !is_core[i] && !grid.neighbours(cell, 26).any(|(n, _)| core(n)) {
+                thicker.states[cell] = State::Occupied;
+            }
+        }
+        let (cells, _) = component_with_most_surface(&thicker)?;
+        let clearance_m = clearance(&thicker, &cells) * thicker.cell_m;
+        Some(Self { cells, enclosed_share: self.enclosed_share, clearance_m, grid: thicker })
+    }
 }
 
 impl Grid {

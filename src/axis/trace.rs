@@ -208,6 +208,15 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let strict_share = if strictly { void.enclosed_share } else { 0.0 };
     let mut skeleton = skeleton::skeleton(&void, ends);
     if skeleton.loop_arm_m.is_some() && ends.is_none() {
+        // A way through a wall that is thin, or leaks, is none.
+        if let Some(thicker) = void.without_thin_parts() {
+            let way = skeleton::skeleton(&thicker, ends);
+            if way.loop_arm_m.is_none() {
+                (void, skeleton) = (thicker, way);
+            }
+        }
+    }
+    if skeleton.loop_arm_m.is_some() && ends.is_none() {
         // In a very short tunnel only a ring along the wall is well enclosed; with more patience its middle is too.
         void = find_void(&sample, &spacing, true, &mut warnings)?;
         skeleton = skeleton::skeleton(&void, ends);
@@ -612,6 +621,47 @@ mod tests {
             frame.forward.cross(&there).norm().atan2(frame.forward.dot(&there).abs()).to_degrees()
         };
         (axis.length(), (0..=steps).map(angle).fold(0.0, f64::max))
+    }
+
+    /// A corridor of 2.4 x 2.4 x 24 m along x with rooms of 7 x 4 x 2.4 m behind walls of 0.4 m on its left, each with a door
+    /// of 1 m at its start. Points every 6 cm; the scan of the walls between has a hole of 36 cm at the far end of each room.
+    fn corridor_with_rooms() -> Vec<Vec3> {
+        const ROOMS: [f64; 3] = [1.5, 9.2, 16.9];
+        let within = |p: &Vec3, low: [f64; 3], high: [f64; 3]| (0..3).all(|a| p[a] > low[a] && p[a] < high[a]);
+        let inside = |p: &Vec3| {
+            within(p, [-1.0, -1.2, 0.0], [25.0, 1.2, 2.4])
+                || ROOMS.iter().any(|x| {
+                    within(p, [x - 0.7, 1.6, 0.0], [x + 6.3, 5.6, 2.4])
+                        || within(p, [x - 0.5, 1.1, 0.0], [x + 0.5, 1.7, 2.0])
+                })
+        };
+        let hole = |p: &Vec3| ROOMS.iter().any(|x| within(p, [x + 5.3, 0.9, 1.0], [x + 5.66, 1.8, 1.36]));
+        let step = 0.06;
+        let mut points = Vec::new();
+        for i in 0..400 {
+            for j in -22..96 {
+                for k in -1..42 {
+                    let p = [i, j, k].map(|n| (f64::from(n) + 0.5) * step).into();
+                    let beside = [Vec3::x(), Vec3::y(), Vec3::z()].map(|a| [p + a * step, p - a * step]);
+                    if !inside(&p) && beside.iter().flatten().any(&inside) && !hole(&p) {
+                        points.push(p);
+                    }
+                }
+            }
+        }
+        points
+    }
+
+    #[test]
+    fn a_wall_that_leaks_makes_no_loop_of_a_corridor_and_its_rooms() {
+        let points = corridor_with_rooms();
+        let void = find_void(&points, &Spacing::estimate(&points), false, &mut Vec::new()).unwrap();
+        assert!(skeleton::skeleton(&void, None).loop_arm_m.is_some(), "the holes are wide enough to be a way");
+        let (axis, summary) = trace(&points, &Settings::default()).unwrap();
+        assert!((axis.length() - 24.0).abs() < 1.0, "{}", axis.length());
+        assert!((0..=24).all(|s| axis.frame_at(axis.start_chainage() + f64::from(s)).origin.y.abs() < 0.15));
+        assert_eq!(summary.branches.len(), 3, "{:?}", summary.branches);
+        assert!(summary.branches.iter().all(|b| b.side == Side::Left));
     }
 
     #[test]

@@ -38,7 +38,7 @@ use std::time::SystemTime;
 pub const STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "clean", version: 1, needs: &["ingest"] },
-    Stage { name: "axis", version: 2, needs: &["clean"] },
+    Stage { name: "axis", version: 3, needs: &["clean"] },
     Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 3, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
@@ -53,7 +53,7 @@ pub const STAGES: &[Stage] = &[
 /// The stages of a run that starts from a mesh.
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
-    Stage { name: "axis", version: 2, needs: &["ingest"] },
+    Stage { name: "axis", version: 3, needs: &["ingest"] },
     Stage { name: "mesh", version: 3, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
