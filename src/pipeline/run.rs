@@ -54,7 +54,7 @@ pub const STAGES: &[Stage] = &[
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 3, needs: &["ingest"] },
-    Stage { name: "mesh", version: 3, needs: &["ingest", "axis"] },
+    Stage { name: "mesh", version: 4, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
     Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
