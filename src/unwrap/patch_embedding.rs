@@ -22,12 +22,8 @@ const SHORTEST_M: f64 = 1e-9;
 ///
 /// # Errors
 /// What the sparse solver refuses.
-pub(super) fn embed(
-    mesh: &Mesh,
-    twin: &[u32],
-    is_free: &[bool],
-    uv: &[Vec2],
-) -> Result<Option<Vec<Vec2>>, sparse::Error> {
+pub(super) fn embed(mesh: &Mesh, is_free: &[bool], uv: &[Vec2]) -> Result<Option<Vec<Vec2>>, sparse::Error> {
+    let twin = mesh.twins();
     let mut places = uv.to_vec();
     let mut is_unknown = is_free.to_vec();
     let mut holes: Vec<Vec<u32>> = Vec::new();

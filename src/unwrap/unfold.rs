@@ -52,7 +52,7 @@ pub fn unfold(mesh: &Mesh, uv: &mut [Vec2]) -> Unfolded {
         return result;
     }
     let around = faces_around(mesh);
-    let twin = topology::twins(faces).expect("a Mesh is manifold");
+    let twin = mesh.twins();
     let original = uv.to_vec();
     let mut best = (bad.len(), original.clone());
     // Laid anew, a patch is even inside; what then still folds at its rim is a matter for the sweeps again.
@@ -63,7 +63,7 @@ pub fn unfold(mesh: &Mesh, uv: &mut [Vec2]) -> Unfolded {
             let vertices = inner_vertices(mesh, &around, &patch, &in_patch);
             for _ in 0..SWEEPS {
                 for &v in &vertices {
-                    uv[v as usize] = neighbour_mean(mesh, uv, &around, &twin, v);
+                    uv[v as usize] = neighbour_mean(mesh, uv, &around, twin, v);
                 }
             }
             bad = flipped(uv);
@@ -82,8 +82,8 @@ pub fn unfold(mesh: &Mesh, uv: &mut [Vec2]) -> Unfolded {
             let mut is_free = vec![false; uv.len()];
             inner_vertices(mesh, &around, &patch, &in_patch).into_iter().for_each(|v| is_free[v as usize] = true);
             // What the solver refuses stays flipped, and is counted.
-            let Ok(Some(moved)) = embed(mesh, &twin, &is_free, uv) else { break };
-            for piece in connected(&patch, &in_patch, &twin) {
+            let Ok(Some(moved)) = embed(mesh, &is_free, uv) else { break };
+            for piece in connected(&patch, &in_patch, twin) {
                 let flips = |uv: &[Vec2]| {
                     piece.iter().filter(|&&f| orientation(faces[f as usize].map(|v| uv[v as usize])) <= 0.0).count()
                 };
