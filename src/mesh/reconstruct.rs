@@ -16,6 +16,8 @@ use std::f64::consts::TAU;
 const MANY_DEPTHS_PERCENT: f64 = 5.0;
 /// Above this share of points in front of the surface, these are rough rock and no furniture.
 const MUCH_FURNITURE: f64 = 0.1;
+/// Above this share the mean section says nothing.
+const MOSTLY_IN_FRONT: f64 = 0.4;
 /// A mesh from elsewhere is taken as it is when its largest piece has this share of the area.
 const ONE_PIECE: f64 = 0.9;
 /// Points that stand for the pieces of a mesh.
@@ -159,6 +161,17 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
             format!(
                 "{share:.1} % of the cells hold points at several distances from the axis; the section method keeps one; \
                  mesh.method = \"poisson\" keeps all"
+            ),
+        ));
+    }
+    let front = segmentation.class.iter().filter(|c| **c == Class::Furniture).count();
+    if front as f64 > MOSTLY_IN_FRONT * (points + front) as f64 {
+        warnings.push(Warning::new(
+            "mostly-in-front",
+            format!(
+                "{:.0} % of the points stand in front of the rest and were left out: the tunnel is not understood as a \
+                 section that runs along an axis; mesh.method = \"poisson\" keeps them",
+                100.0 * front as f64 / (points + front) as f64
             ),
         ));
     }

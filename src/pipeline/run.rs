@@ -40,7 +40,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "clean", version: 1, needs: &["ingest"] },
     Stage { name: "axis", version: 3, needs: &["clean"] },
     Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
-    Stage { name: "segment", version: 4, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
@@ -54,7 +54,7 @@ pub const STAGES: &[Stage] = &[
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 3, needs: &["ingest"] },
-    Stage { name: "mesh", version: 4, needs: &["ingest", "axis"] },
+    Stage { name: "mesh", version: 5, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
     Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },

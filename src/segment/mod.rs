@@ -26,9 +26,6 @@ const POINT_DISTANCES_A_CELL: f64 = 2.5;
 /// Cells of the depth picture are not finer than this share of the perimeter (5 cm in a rail tunnel).
 const FINEST_SHARE_OF_PERIMETER: f64 = 1.0 / 500.0;
 
-/// More than this share of the surface's points in front of it is no furniture but rock: boulders, a section that is not
-/// understood.
-const ROCK_IN_FRONT: f64 = 0.25;
 /// More points outside than this share are worth a warning.
 const MUCH_OUTSIDE: f64 = 0.25;
 
@@ -250,21 +247,6 @@ pub fn classify(
         if sampling.is_profiles() { (0, 0) } else { long_things::find(&grid, &cells, &mut class) };
     drop(cells);
     let floor = if axis.is_shaft() { None } else { floor::find(&grid, &section, &depth) };
-    let mut warnings = Vec::new();
-    let count = |class: &[Class], of: Class| class.iter().filter(|k| **k == of).count() as f64;
-    let front = count(&class, Class::Furniture);
-    let front_share = front / (front + count(&class, Class::Wall)).max(1.0);
-    if front_share > ROCK_IN_FRONT {
-        class.par_iter_mut().filter(|k| **k == Class::Furniture).for_each(|k| *k = Class::Wall);
-        warnings.push(Warning::new(
-            "rock-in-front",
-            format!(
-                "{:.0} % of the surface stands in front of the rest, more than furniture does: it is taken for rock and \
-                 stays on the map",
-                100.0 * front_share
-            ),
-        ));
-    }
     if let Some(floor) = &floor {
         class.par_iter_mut().zip(&coordinates).for_each(|(k, c)| {
             if *k == Class::Wall && floor.contains(c.chainage, section.girth(c.chainage, c.angle())) {
@@ -286,7 +268,9 @@ pub fn classify(
             *k = Class::Outside;
         }
     });
-    let outside_share = count(&class, Class::Outside) / class.len().max(1) as f64;
+    let mut warnings = Vec::new();
+    let outside = class.iter().filter(|k| **k == Class::Outside).count();
+    let outside_share = outside as f64 / class.len().max(1) as f64;
     if outside_share > MUCH_OUTSIDE {
         warnings.push(Warning::new(
             "much-outside",
@@ -355,34 +339,6 @@ mod tests {
         assert!(wall.0 > 0.98 && wall.1 > 0.97, "wall {wall:?} {summary:?}");
         assert!(floor.0 > 0.95 && floor.1 > 0.95, "floor {floor:?} {summary:?}");
         assert!(summary.has_floor && summary.patches.furniture_patches > 0);
-    }
-
-    #[test]
-    fn boulders_all_over_are_rock_and_stay() {
-        use std::f64::consts::TAU;
-        let axis = Axis::through(&[Vec3::zeros(), Vec3::new(20.0, 0.0, 0.0)], 0.0).unwrap();
-        // A tube of 2 m radius; on every second square of 1.25 m, shrunk, a boulder of 0.7 m height.
-        let tube = |boulders: f64| -> Vec<Vec3> {
-            (0..160_000)
-                .map(|i| {
-                    let s = 20.0 * (f64::from(i) * 0.618_033_988_749_895).fract();
-                    let a = TAU * (f64::from(i) * 0.754_877_666_246_693).fract();
-                    let (x, y) = (s / 1.25, a / TAU * 10.0);
-                    let on = (x.floor() + y.floor()) as i64 % 2 == 0;
-                    let within = (x.fract() - 0.5).abs().max((y.fract() - 0.5).abs()) < boulders / 2.0;
-                    let r = if on && within { 1.3 } else { 2.0 };
-                    Vec3::new(s, r * a.cos(), r * a.sin())
-                })
-                .collect()
-        };
-        let told = |boulders: f64| {
-            let (found, summary) = classify_positions(&tube(boulders), &axis, &Settings::default()).unwrap();
-            let front = found.class.iter().filter(|k| **k == Class::Furniture).count();
-            (front, summary.warnings.iter().any(|w| w.code == "rock-in-front"))
-        };
-        assert_eq!(told(0.85), (0, true));
-        let (few, warned) = told(0.4);
-        assert!(few > 8_000 && !warned, "{few}");
     }
 
     /// Four stations, 3 mm noise, 0.5 % outliers, everything that stands in the way: the whole way from the scan.
