@@ -3,7 +3,7 @@
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
 use super::{Mesh, VertexId, poisson, repair, section, topology};
-use crate::axis::Axis;
+use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::{Vec3, wrap_angle};
 use crate::segment::{Class, Segmentation};
 use crate::warning::Warning;
@@ -210,30 +210,34 @@ fn by_poisson(
             ),
         ));
     }
-    let points: Vec<Vec3> = segmentation
-        .coordinates
-        .par_iter()
-        .zip(&segmentation.class)
-        .filter(|(_, k)| k.is_surface() || (rock_in_front && **k == Class::Furniture))
-        .map(|(c, _)| axis.point_at(c))
-        .collect();
-    let wall_line =
-        (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
-    let walls: Vec<Vec3> = segmentation
-        .coordinates
-        .par_iter()
-        .zip(&segmentation.class)
-        .filter(|(_, k)| **k != Class::Noise)
-        .map(|(c, _)| axis.point_at(c))
-        .collect();
     let poisson_options = poisson::Options {
         spacing_m: settings.spacing_m,
         max_gap_m: settings.max_gap_m,
         fill_hole_m: settings.fill_hole_m,
         perimeter_m: segmentation.section.mean_perimeter(),
     };
-    let (raw, poisson) = poisson::reconstruct(points, &walls, axis, &poisson_options);
+    let compressed = poisson::Compressed::for_profiles(&segmentation.sampling, axis, &poisson_options);
+    let place = |c: &AxisCoordinates| compressed.as_ref().map_or_else(|| axis.point_at(c), |k| k.place(c));
+    let classified = || segmentation.coordinates.par_iter().zip(&segmentation.class);
+    let points: Vec<Vec3> = classified()
+        .filter(|(_, k)| k.is_surface() || (rock_in_front && **k == Class::Furniture))
+        .map(|(c, _)| place(c))
+        .collect();
+    let walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
+    let wall_line =
+        (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let (mut raw, mut poisson) = match &compressed {
+        Some(k) => {
+            let options = poisson::Options { spacing_m: Some(k.cell_m), ..poisson_options };
+            poisson::reconstruct(points, &walls, &k.straight, &options)
+        }
+        None => poisson::reconstruct(points, &walls, axis, &poisson_options),
+    };
     drop(walls);
+    if let Some(k) = &compressed {
+        raw.vertices.par_iter_mut().for_each(|v| *v = k.point(v));
+        poisson.spacing_along_m = Some(k.cell_along_m());
+    }
     warnings.extend(poisson.warning(settings.spacing_m));
     let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
     let mut openings = Vec::new();
@@ -474,6 +478,26 @@ mod tests {
             assert!((3..=most).contains(&summary.boundary_loops), "{method:?}: {}", summary.boundary_loops);
             assert!(summary.warnings.iter().any(|w| w.code == "side-openings"));
         }
+    }
+
+    #[test]
+    fn profiles_half_a_metre_apart_make_one_poisson_surface() {
+        // 41 profiles of 1200 points each: 1 cm around, 50 cm along.
+        let points: Vec<Vec3> = (0..41 * 1200)
+            .map(|i| {
+                let a = TAU * (f64::from(i % 1200) + 0.31 * f64::from(i / 1200)) / 1200.0;
+                Vec3::new(0.5 * f64::from(i / 1200), -2.0 * a.sin(), 2.0 * a.cos())
+            })
+            .collect();
+        let (segmentation, _) = classify_positions(&points, &axis(), &segment::Settings::default()).unwrap();
+        let settings = Settings { method: Method::Poisson, ..Settings::default() };
+        let (mesh, summary) = reconstruct(&segmentation, &axis(), &settings).unwrap();
+        assert_eq!(summary.boundary_loops, 2);
+        assert!(summary.filled_percent < 0.1, "{}", summary.filled_percent);
+        assert!(mesh.vertices().iter().all(|v| (v.y.hypot(v.z) - 2.0).abs() < 0.006));
+        let covered = summary.area_m2 / (TAU * 2.0 * 20.0);
+        assert!((0.96..1.04).contains(&covered), "{covered}");
+        assert!(summary.poisson.unwrap().spacing_along_m.unwrap() > 0.3);
     }
 
     #[test]

@@ -9,6 +9,8 @@
 //! solved on an octree that is as deep as the points are dense, from coarse to fine (`octree`, `solve`), its level set comes
 //! out of `surface_nets` (`extract`) and is moved onto the points (`fit`), and everything that no point supports goes or is marked (`support`).
 //!
+//! Scans of profiles are compressed along the axis meanwhile (`compressed`).
+//!
 //! Departures from the papers: trilinear functions, nested so that each level takes the coarser one's values at its rim;
 //! a point is spread at one depth, not between two; the points' own areas come from their density one level up; the
 //! level set is taken on the finest cells only, near points only, and trimmed by distance instead of density.
@@ -16,6 +18,7 @@
 //! Guarantees: no face farther from a point than `max_gap_m` (or a cell) unless it is marked filled; same bytes on any
 //! number of threads. Cost: linear in points and surface but for sorts.
 
+mod compressed;
 mod extract;
 mod fit;
 mod octree;
@@ -31,6 +34,7 @@ use crate::numeric::Vec3;
 use crate::spatial::KdTree;
 use crate::spatial::voxel_grid::bounds;
 use crate::warning::Warning;
+pub(super) use compressed::Compressed;
 use rayon::prelude::*;
 use serde::Serialize;
 pub(super) use support::Raw;
@@ -56,11 +60,22 @@ pub(super) struct Options {
     pub perimeter_m: f64,
 }
 
+impl Options {
+    /// Edge of a cell for points at this distance from each other.
+    fn cell(&self, point_distance_m: f64) -> f64 {
+        let chosen = CELL_IN_POINT_DISTANCES * point_distance_m;
+        self.spacing_m.unwrap_or_else(|| chosen.max(self.perimeter_m * FINEST_SHARE_OF_PERIMETER))
+    }
+}
+
 /// What was done, for the report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Summary {
     /// Edge of a cell of the finest level, metres.
     pub spacing_m: f64,
+    /// Length of a cell along the axis where a scan of profiles was compressed, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spacing_along_m: Option<f64>,
     /// Points given.
     pub points_used: usize,
     /// Points dropped because no side of them can be reached from the axis: buried inside the rock.
@@ -117,9 +132,7 @@ impl Summary {
 /// `walls` are all points that block the way, those of the surface included.
 pub(super) fn reconstruct(points: Vec<Vec3>, walls: &[Vec3], axis: &Axis, options: &Options) -> (Raw, Summary) {
     let spacing_m = spacing(&points);
-    let cell_m = options
-        .spacing_m
-        .unwrap_or_else(|| (CELL_IN_POINT_DISTANCES * spacing_m).max(options.perimeter_m * FINEST_SHARE_OF_PERIMETER));
+    let cell_m = options.cell(spacing_m);
     let mut normals = normals::unoriented(&points, NEIGHBOURS);
     let Sides { hidden, unclear } = void_side::face_the_void(
         &points,
