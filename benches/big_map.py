@@ -49,7 +49,7 @@ def python_map(run, cell, out):
     width, height = int(np.ceil((u1 - u0) / cell)), int(np.ceil((v1 - v0) / cell))
     profile = dict(driver="GTiff", width=width, height=height, tiled=True, blockxsize=256, blockysize=256, compress="deflate",
                    zlevel=3, bigtiff="if_safer", transform=from_origin(u0, v1, cell, cell))
-    kinds = {"color": (3, "u1", 2), "intensity": (1, "u2", 2), "labels": (1, "u1", 2), "xyz": (3, "f4", 1)}
+    kinds = {"color": (3, "uint8", 2), "intensity": (1, "uint16", 2), "labels": (1, "uint8", 2), "xyz": (3, "float32", 1)}
     files = {k: rasterio.open(f"{out}/{k}.tif", "w", count=n, dtype=t, predictor=p, **profile) for k, (n, t, p) in kinds.items()}
     tree = cKDTree(np.stack([u, v], 1))
     for row in range(0, height, BLOCK):

@@ -176,6 +176,8 @@ fn judge(drawn: &Drawn) -> serde_json::Value {
         assert!(folder.join(product).metadata().unwrap().len() > 100, "{product}");
     }
     let found = vector::read(&folder.join("planes.gpkg"), Space::Scan).unwrap().features;
+    // A plane is one trace, or a few where the edges of the map cut it: crossings do not break traces to pieces.
+    assert!((12..=30).contains(&found.len()), "{} traces of 12 planes", found.len());
     let (mut errors, mut unreliable) = (Vec::new(), 0);
     let mut in_set: Vec<(i64, Vec3)> = Vec::new();
     let mut met = [false; 12];

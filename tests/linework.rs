@@ -1,4 +1,5 @@
-//! Linework through the real program: map to wall and back at the coordinates of a national grid, in all formats.
+//! Linework through the real program: map to wall and back at the coordinates of a national grid, in all formats, and the
+//! certificate of a run from its files.
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
 
@@ -6,6 +7,7 @@ use adit::io::vector::{self, Shapes, Space};
 use adit::linework::{Feature, Kind, Value};
 use adit::numeric::Vec3;
 use assert_cmd::Command;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
@@ -111,6 +113,70 @@ fn bolts_keep_their_offset_and_what_is_lost_is_told() {
     }
     let output = adit(&["drape", path(&run), "--in", path(&file("none.gpkg")), "--out", path(&file("x.gpkg"))]);
     assert_eq!(output.status.code(), Some(3), "{}", told(&output));
+}
+
+#[test]
+fn the_certificate_finds_a_shifted_raster_and_changed_bytes() {
+    let place = tempfile::tempdir().unwrap();
+    let run = run(place.path());
+    let report: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(run.join("report.json")).unwrap()).unwrap();
+    let trip = &report["roundtrip"];
+    assert!(trip["max_m"].as_f64().unwrap() < 1e-6 && trip["max_px"].as_f64().unwrap() < 1e-4, "{trip}");
+    assert!(
+        trip["pixels"]["max_px"].as_f64().unwrap() < 0.01 && trip["pixels"]["sent"].as_u64().unwrap() > 1000,
+        "{trip}"
+    );
+    assert!(trip["lines"]["max_m"].as_f64().unwrap() < 1e-3 && trip["lines"]["sent"].as_u64().unwrap() > 20, "{trip}");
+    let verify = || {
+        let output = adit(&["verify", path(&run)]);
+        (output.status.code(), told(&output))
+    };
+    let (code, text) = verify();
+    assert_eq!(code, Some(0), "{text}");
+
+    // The raster says that it lies two pixels beside its place; nobody would see it, the hash in the report is right.
+    let raster = run.join("map/distortion.tif");
+    let bytes = fs::read(&raster).unwrap();
+    let u = report["map"]["u_min_m"].as_f64().unwrap();
+    let v = report["map"]["v_max_m"].as_f64().unwrap();
+    let tie = [u.to_le_bytes(), v.to_le_bytes()].concat();
+    let at = bytes.windows(16).position(|w| w == tie).expect("the tie point is in the file");
+    let mut shifted = bytes.clone();
+    shifted[at..at + 8].copy_from_slice(&(u + 0.08).to_le_bytes());
+    fs::write(&raster, &shifted).unwrap();
+    let (code, text) = verify();
+    assert_eq!(code, Some(5), "{text}");
+    assert!(text.contains("distortion.tif lies 2 px to the right"), "{text}");
+
+    // The same shift in the content, with the bytes of the report made to agree: another layer of the grid one pixel on.
+    let hash = |name: &str| adit::pipeline::run_folder::sha256_of(&run.join(name)).unwrap();
+    let mut forged = report.clone();
+    let corner = u - 0.08;
+    shifted[at..at + 8].copy_from_slice(&corner.to_le_bytes());
+    fs::write(&raster, &shifted).unwrap();
+    forged["map"]["u_min_m"] = serde_json::json!(corner);
+    for product in forged["products"].as_array_mut().unwrap() {
+        let name = product["name"].as_str().unwrap().to_owned();
+        product["sha256"] = serde_json::json!(hash(&name));
+    }
+    fs::write(run.join("report.json"), forged.to_string()).unwrap();
+    let (code, text) = verify();
+    assert_eq!(code, Some(5), "{text}");
+    let content = |l: &str| l.contains("FAIL") && l.contains("distortion.tif") && l.contains("pixels differ");
+    assert!(text.lines().any(content), "{text}");
+    fs::write(&raster, &bytes).unwrap();
+    fs::write(run.join("report.json"), report.to_string()).unwrap();
+
+    // One byte of a picture.
+    let picture = run.join("map/color.png");
+    let mut changed = fs::read(&picture).unwrap();
+    let last = changed.len() - 1;
+    changed[last] ^= 1;
+    fs::write(&picture, &changed).unwrap();
+    let (code, text) = verify();
+    assert_eq!(code, Some(5), "{text}");
+    assert!(text.contains("map/color.png has changed since the run"), "{text}");
 }
 
 /// Other programs read what is written: fiona or geopandas, and ezdxf, when Python has them.

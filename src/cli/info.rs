@@ -1,8 +1,9 @@
 //! `adit info`: what is in a scan or mesh file, and what is suspicious about it.
 
 use super::read_rate::{self, ReadRate};
+use super::run_surface::io_failure;
 use super::{Console, Exit, Failure, Result};
-use crate::io::{self, ErrorKind, ScanInfo};
+use crate::io::{self, ScanInfo};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -47,7 +48,7 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
                 }
             }
             Err(error) => {
-                let failure = failure(error);
+                let failure = io_failure(error);
                 if first_failure.is_none() {
                     first_failure = Some(failure);
                 } else {
@@ -67,16 +68,6 @@ fn look(
 ) -> std::result::Result<(ScanInfo, Option<ReadRate>), io::Error> {
     let rate = with_rate.then(|| read_rate::measure(file, settings)).transpose()?;
     Ok((io::inspect(file, settings)?, rate))
-}
-
-fn failure(error: io::Error) -> Failure {
-    let exit = match error.kind() {
-        ErrorKind::BadInput => Exit::BadInput,
-        ErrorKind::Unsupported => Exit::Unsupported,
-        ErrorKind::Output => Exit::Resources,
-        ErrorKind::Settings => Exit::Usage,
-    };
-    Failure::new(exit, error)
 }
 
 /// The facts for a person, one a line.

@@ -1,15 +1,14 @@
 //! `adit lift`: an edited picture of the map becomes labels on the points and faces of the scan.
 
+use super::run_surface::{RunSurface, cannot_write, io_failure, need};
 use super::{Console, Exit, Failure, Result};
-use crate::cut::Strip;
 use crate::io::picture::{PictureFile, read_picture};
-use crate::io::{self, ErrorKind, LabelsFile, PointColumns, world_file};
+use crate::io::{self, LabelsFile, PointColumns, world_file};
 use crate::lift::{self, Base, Edited, LabelMap, NO_SURFACE};
 use crate::map::{self, PaletteEntry, Placement};
-use crate::mesh::{Mesh, anchor};
+use crate::mesh::anchor;
 use crate::numeric::Vec2;
-use crate::pipeline::Pipeline;
-use crate::unwrap::{self, Chart};
+use crate::unwrap;
 use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -46,8 +45,6 @@ pub struct Arguments {
 
 /// Lifts the labels.
 pub fn run(arguments: Arguments, console: &Console) -> Result {
-    let pipeline = Pipeline::load(&need(&arguments.run, "pipeline.toml")?, &[])
-        .map_err(|error| Failure::new(Exit::Usage, error))?;
     let (label_map, mut told, classes) = read_label_map(&arguments)?;
     if let Some(path) = &arguments.recognised {
         let picture = picture_of(&label_map, &classes);
@@ -56,33 +53,19 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
         world_file::write(path, &label_map.placement).map_err(|e| Failure::new(Exit::Resources, e))?;
     }
 
-    let (raw, _) = io::ply::read_chart(&need(&arguments.run, "chart.ply")?).map_err(io_failure)?;
+    let surface = RunSurface::open(&arguments.run)?;
     let points = ["points.laz", "points.ply"].map(|name| arguments.run.join(name)).into_iter().find(|p| p.is_file());
     let Some(points) = points else {
         let message = format!("{} has no points.laz: lift needs a finished run of a scan", arguments.run.display());
         return Err(Failure::message(Exit::BadInput, message));
     };
     // The labels in the file are replaced, so which column holds them does not matter; its unit does.
-    let ingest = io::Settings { unit: pipeline.ingest.unit, label_column: Some("none".into()), ..Default::default() };
+    let ingest =
+        io::Settings { unit: surface.pipeline.ingest.unit, label_column: Some("none".into()), ..Default::default() };
     let (cloud, _) = io::read_cloud(&[points], &ingest).map_err(io_failure)?;
 
     // Both files keep scan coordinates, each in a local frame of its own.
-    let (chart_frame, frame) = (&raw.frame, cloud.frame());
-    let same =
-        chart_frame.origin_in_scan == frame.origin_in_scan && chart_frame.metres_per_unit == frame.metres_per_unit;
-    let vertices = if same {
-        raw.vertices
-    } else {
-        raw.vertices.iter().map(|v| frame.local_from_scan(&chart_frame.scan_from_local(v))).collect()
-    };
-    let observed = raw.observed.unwrap_or_else(|| vec![true; raw.faces.len()]);
-    let uv = raw.uv.unwrap_or_default();
-    let chart = Mesh::new(vertices, raw.faces, observed)
-        .map_err(anyhow::Error::from)
-        .and_then(|mesh| Ok(Strip::from_disk(mesh)?))
-        .and_then(|strip| Ok(Chart::new(strip, uv)?))
-        .map_err(|error| Failure::new(Exit::BadInput, error.context("chart.ply is not the chart of a run")))?;
-
+    let RunSurface { pipeline, chart, .. } = surface.in_frame(cloud.frame())?;
     let (mut anchors, _) = anchor::anchor_points(chart.strip().mesh(), cloud.positions(), &pipeline.anchor);
     anchors.release(&unwrap::covered_points(&unwrap::ChartIndex::of(&chart), &anchors));
     let uv = anchors.in_chart(chart.strip().mesh(), chart.uv());
@@ -240,15 +223,6 @@ fn picture_of(label_map: &LabelMap, classes: &[PaletteEntry]) -> map::Picture {
     map::Picture { width: label_map.width, height: label_map.height, rgba }
 }
 
-fn need(run: &Path, name: &str) -> Result<PathBuf> {
-    let path = run.join(name);
-    if path.is_file() {
-        return Ok(path);
-    }
-    let message = format!("{} is not the folder of a finished run: {name} is missing", run.display());
-    Err(Failure::message(Exit::BadInput, message))
-}
-
 /// The extension tells the format, so it stays at the end.
 fn partial_name(path: &Path) -> PathBuf {
     let mut name = std::ffi::OsString::from(".partial-");
@@ -256,20 +230,6 @@ fn partial_name(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
-fn io_failure(error: io::Error) -> Failure {
-    let exit = match error.kind() {
-        ErrorKind::BadInput => Exit::BadInput,
-        ErrorKind::Unsupported => Exit::Unsupported,
-        ErrorKind::Output => Exit::Resources,
-        ErrorKind::Settings => Exit::Usage,
-    };
-    Failure::new(exit, error)
-}
-
 fn lift_failure(error: lift::Error) -> Failure {
     Failure::new(Exit::Internal, error)
-}
-
-fn cannot_write(path: &Path, error: std::io::Error) -> Failure {
-    Failure::message(Exit::Resources, format!("{} cannot be written: {error}", path.display()))
 }

@@ -1,12 +1,10 @@
 //! `adit package`: everything that is needed to use the map without Adit, in one ZIP file.
 
+use super::run_surface::RunSurface;
 use super::{Console, Exit, Failure, Result};
-use crate::cut::Strip;
-use crate::io::{self, MapFolder, PackageError, PackageFile};
+use crate::io::{MapFolder, PackageError, PackageFile};
 use crate::map::qgis::{self, ProjectLayer};
 use crate::map::{self, DrawInput, Layer, Legend};
-use crate::mesh::Mesh;
-use crate::unwrap::Chart;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -138,26 +136,15 @@ fn draw_back_map(
     legend: &mut Legend,
     layers: &[Layer],
 ) -> std::result::Result<PathBuf, Failure> {
-    let (raw, _) =
-        io::ply::read_chart(&arguments.run.join("chart.ply")).map_err(|e| Failure::new(Exit::BadInput, e))?;
-    let observed = raw.observed.unwrap_or_else(|| vec![true; raw.faces.len()]);
-    let uv = raw.uv.unwrap_or_default();
-    let chart = Mesh::new(raw.vertices, raw.faces, observed)
-        .map_err(anyhow::Error::from)
-        .and_then(|mesh| Ok(Strip::from_disk(mesh)?))
-        .and_then(|strip| Ok(Chart::new(strip, uv)?))
-        .map_err(|error| Failure {
-            exit: Exit::BadInput,
-            error: error.context("chart.ply is not the chart of a run"),
-        })?;
+    let surface = RunSurface::open(&arguments.run)?;
     let mut folder = arguments.out.as_os_str().to_owned();
     folder.push(".back-map");
     let folder = PathBuf::from(folder);
     fs::create_dir_all(&folder).map_err(|e| cannot(&folder, &e))?;
     let input = DrawInput {
-        chart: &chart,
+        chart: &surface.chart,
         points: None,
-        frame: &raw.frame,
+        frame: &surface.frame,
         section_offsets_m: None,
         design_offsets_m: None,
         quality: None,

@@ -1,7 +1,8 @@
 //! `adit register`: fine registration of overlapping stations, into a file of poses.
 
+use super::run_surface::io_failure;
 use super::{Console, Exit, Failure, Result};
-use crate::io::{self, ErrorKind, Pose, StationScan};
+use crate::io::{self, Pose, StationScan};
 use crate::numeric::Vec3;
 use crate::register::{self, Motion, Overlap, Surface};
 use std::path::{Path, PathBuf};
@@ -110,14 +111,4 @@ fn moved(pose: &Pose, motion: &Motion, origin: &Vec3, metres_per_unit: f64) -> P
         rotation: motion.rotation * pose.rotation,
         translation: motion.rotation * (pose.translation - centre) + centre + shift,
     }
-}
-
-fn io_failure(error: io::Error) -> Failure {
-    let exit = match error.kind() {
-        ErrorKind::BadInput => Exit::BadInput,
-        ErrorKind::Unsupported => Exit::Unsupported,
-        ErrorKind::Output => Exit::Resources,
-        ErrorKind::Settings => Exit::Usage,
-    };
-    Failure::new(exit, error)
 }

@@ -6,7 +6,7 @@ use crate::cut::Strip;
 use crate::io::{self, ErrorKind};
 use crate::linework::Feature;
 use crate::mesh::Mesh;
-use crate::numeric::Vec3;
+use crate::numeric::{Vec2, Vec3};
 use crate::pipeline::Pipeline;
 use crate::unwrap::Chart;
 use crate::warning::Warning;
@@ -24,13 +24,20 @@ impl RunSurface {
         let pipeline = Pipeline::load(&need(run, "pipeline.toml")?, &[]).map_err(|e| Failure::new(Exit::Usage, e))?;
         let (raw, _) = io::ply::read_chart(&need(run, "chart.ply")?).map_err(io_failure)?;
         let observed = raw.observed.unwrap_or_else(|| vec![true; raw.faces.len()]);
-        let uv = raw.uv.unwrap_or_default();
-        let chart = Mesh::new(raw.vertices, raw.faces, observed)
-            .map_err(anyhow::Error::from)
-            .and_then(|mesh| Ok(Strip::from_disk(mesh)?))
-            .and_then(|strip| Ok(Chart::new(strip, uv)?))
-            .map_err(|error| Failure::new(Exit::BadInput, error.context("chart.ply is not the chart of a run")))?;
+        let chart = chart_of(raw.vertices, raw.faces, observed, raw.uv.unwrap_or_default())?;
         Ok(Self { pipeline, frame: raw.frame, chart })
+    }
+
+    /// The same surface in the local metres of another frame.
+    pub(super) fn in_frame(self, frame: &ScanFrame) -> Result<Self> {
+        if self.frame.origin_in_scan == frame.origin_in_scan && self.frame.metres_per_unit == frame.metres_per_unit {
+            return Ok(self);
+        }
+        let mesh = self.chart.strip().mesh();
+        let moved = |v: &Vec3| frame.local_from_scan(&self.frame.scan_from_local(v));
+        let vertices = mesh.vertices().iter().map(moved).collect();
+        let chart = chart_of(vertices, mesh.faces().to_vec(), mesh.observed().to_vec(), self.chart.uv().to_vec())?;
+        Ok(Self { pipeline: self.pipeline, frame: frame.clone(), chart })
     }
 
     /// Features in scan coordinates, in local metres.
@@ -65,6 +72,14 @@ impl RunSurface {
         }
         Ok(directions)
     }
+}
+
+fn chart_of(vertices: Vec<Vec3>, faces: Vec<[u32; 3]>, observed: Vec<bool>, uv: Vec<Vec2>) -> Result<Chart> {
+    Mesh::new(vertices, faces, observed)
+        .map_err(anyhow::Error::from)
+        .and_then(|mesh| Ok(Strip::from_disk(mesh)?))
+        .and_then(|strip| Ok(Chart::new(strip, uv)?))
+        .map_err(|error| Failure::new(Exit::BadInput, error.context("chart.ply is not the chart of a run")))
 }
 
 fn moved(features: &[Feature], place: impl Fn(&Vec3) -> Vec3) -> Vec<Feature> {

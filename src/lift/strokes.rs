@@ -59,6 +59,8 @@ const STRAIGHT_ON: f64 = 0.64;
 const DIRECTION_PX: usize = 12;
 /// Strokes continue each other over a gap when both bend less than this there: cosine of 25 degrees.
 const FACING: f64 = 0.9;
+/// Gaps may be so many times longer than others where they are painted over.
+const COVERED: f64 = 6.0;
 /// Half the window, in pixels, over which pixel steps are smoothed.
 const SMOOTHING_PX: usize = 4;
 
@@ -108,7 +110,12 @@ pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettin
             areas.push(Patch { label: piece.label, width_px, rings });
         }
     }
-    summary.gaps = close_gaps(&mut lines, settings.gap_m / cell);
+    let is_painted = |p: Vec2| {
+        let (x, y) = (p.x.floor(), p.y.floor());
+        let inside = x >= 0.0 && y >= 0.0 && x < map.width as f64 && y < map.height as f64;
+        inside && !matches!(map.labels[y as usize * map.width + x as usize], 0 | NO_SURFACE)
+    };
+    summary.gaps = close_gaps(&mut lines, settings.gap_m / cell, &is_painted);
     (summary.strokes, summary.areas) = (lines.len(), areas.len());
     let feature = |class: &str, id: usize, kind: Kind, label: Label, width_px: f64, parts: Vec<Vec<Vec2>>| {
         let on_map = |p: &Vec2| {
@@ -137,37 +144,46 @@ pub fn strokes(map: &LabelMap, classes: &[PaletteEntry], settings: &StrokeSettin
 }
 
 /// Joins strokes of one class whose ends face each other over a gap, the narrowest gap first; how many were closed.
-fn close_gaps(strokes: &mut Vec<Stroke>, longest_px: f64) -> usize {
-    // The end and the outward direction there, over some pixels.
-    let end = |line: &[Vec2], e: usize| -> (Vec2, Vec2) {
-        let mut ordered: Vec<Vec2> = line.to_vec();
-        if e == 0 {
-            ordered.reverse();
-        }
-        let last = ordered[ordered.len() - 1];
-        let from = ordered.iter().rev().find(|p| (last - **p).norm() >= DIRECTION_PX as f64).unwrap_or(&ordered[0]);
-        (last, (last - from).try_normalize(0.0).unwrap_or_else(Vec2::zeros))
-    };
+///
+/// Where strokes cross at a small angle, the one below ends in two wedges along the other, one on each of its sides: their
+/// tips lie beside each other, up to a width apart, and may overlap. Longer gaps are closed where other strokes cover them.
+fn close_gaps(strokes: &mut Vec<Stroke>, longest_px: f64, is_painted: &dyn Fn(Vec2) -> bool) -> usize {
     let mut closed = 0;
     loop {
-        let ends: Vec<[(Vec2, Vec2); 2]> = strokes.iter().map(|s| [end(&s.line, 0), end(&s.line, 1)]).collect();
+        let ends: Vec<[(Vec2, Vec2); 2]> = strokes.iter().map(|s| [end_of(&s.line, 0), end_of(&s.line, 1)]).collect();
         let mut best: Option<(f64, End, End)> = None;
         for i in 0..strokes.len() {
             for j in i + 1..strokes.len() {
                 if strokes[i].label != strokes[j].label {
                     continue;
                 }
+                let width = strokes[i].width_px.max(strokes[j].width_px).max(1.0);
                 for (e, f) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                     let ((p, out), (q, other)) = (ends[i][e], ends[j][f]);
                     let gap = (q - p).norm();
-                    let faces = -out.dot(&other) >= FACING && (gap < 2.0 || out.dot(&(q - p)) >= FACING * gap);
-                    if gap <= longest_px && faces && best.is_none_or(|b| gap < b.0) {
+                    if -out.dot(&other) < FACING || gap > COVERED * longest_px || best.is_some_and(|b| gap >= b.0) {
+                        continue;
+                    }
+                    let along = out.dot(&(q - p));
+                    let beside = (q - p - out * along).norm();
+                    let faces = along >= FACING * gap || (along >= -2.0 * width && beside <= 1.5 * width + 2.0);
+                    let covered = || {
+                        let steps = gap.ceil().max(1.0);
+                        // The tips themselves may lie on the very edge of what is painted.
+                        let (tip, end) = (width.ceil() as usize, steps as usize);
+                        (tip..end.saturating_sub(tip)).all(|k| is_painted(p + (q - p) * (k as f64 / steps)))
+                    };
+                    if faces && (gap <= longest_px || covered()) {
                         best = Some((gap, (i, e), (j, f)));
                     }
                 }
             }
         }
         let Some((_, (i, e), (j, f))) = best else { return closed };
+        let ((p, out), (q, _)) = (ends[i][e], ends[j][f]);
+        let along = out.dot(&(q - p));
+        // Tips beside each other: both lines are taken back until they meet without a bend.
+        let back = (q - p - out * along).norm() + (-along).max(0.0);
         let mut other = strokes.remove(j).line;
         let line = &mut strokes[i].line;
         if e == 0 {
@@ -176,8 +192,41 @@ fn close_gaps(strokes: &mut Vec<Stroke>, longest_px: f64) -> usize {
         if f == 1 {
             other.reverse();
         }
+        shorten(line, back);
+        other.reverse();
+        shorten(&mut other, back);
+        other.reverse();
         line.append(&mut other);
         closed += 1;
+    }
+}
+
+/// An end of a line and the direction in which the line leaves there, over some pixels.
+fn end_of(line: &[Vec2], end: usize) -> (Vec2, Vec2) {
+    let at = |k: usize| if end == 0 { line[k] } else { line[line.len() - 1 - k] };
+    let last = at(0);
+    let from = (1..line.len()).map(at).find(|p| (last - p).norm() >= DIRECTION_PX as f64);
+    let direction = last - from.unwrap_or_else(|| at(line.len() - 1));
+    (last, direction.try_normalize(0.0).unwrap_or_else(Vec2::zeros))
+}
+
+/// Takes a length off the end of a line, at most to the middle of its last but one vertex and its first.
+fn shorten(line: &mut Vec<Vec2>, length: f64) {
+    let mut left = length;
+    while line.len() > 2 {
+        let (last, before) = (line[line.len() - 1], line[line.len() - 2]);
+        let piece = (last - before).norm();
+        if piece > left {
+            let end = line.len() - 1;
+            line[end] = last + (before - last) * (left / piece);
+            return;
+        }
+        left -= piece;
+        line.pop();
+    }
+    if let [first, last] = &mut line[..] {
+        let piece = (*last - *first).norm();
+        *last += (*first - *last) * (left / piece.max(1e-12)).min(0.5);
     }
 }
 
@@ -688,6 +737,33 @@ mod tests {
         assert_eq!((summary.strokes, summary.gaps), (2, 1), "{summary:?}");
         let whole = found.iter().find(|f| f.attribute("label") == Some(&Value::Integer(2))).unwrap();
         assert!((whole.length() / 5f64.hypot(3.0) - 1.0).abs() < 0.03, "{}", whole.length());
+    }
+
+    #[test]
+    fn a_stroke_under_another_at_a_small_angle_is_one_line() {
+        for (rise, width) in [(0.15, 0.04), (0.2, 0.04), (0.3, 0.06)] {
+            let (under, over) = ([0.5, 2.0 - rise, 5.5, 2.0 + rise], [0.5, 2.0 + rise, 5.5, 2.0 - rise]);
+            let map = painted(&[(7, over, width), (2, under, width)]);
+            let (found, summary) = strokes(&map, &[], &StrokeSettings::default());
+            assert_eq!((summary.strokes, summary.gaps), (2, 1), "{rise}: {summary:?}");
+            let whole = found.iter().find(|f| f.attribute("label") == Some(&Value::Integer(2))).unwrap();
+            assert!((whole.length() / 5f64.hypot(2.0 * rise) - 1.0).abs() < 0.02, "{rise}: {}", whole.length());
+            let worst = whole.parts[0].iter().map(|p| distance(p, under)).fold(0.0, f64::max);
+            assert!(worst < width, "{rise}: {worst}");
+        }
+    }
+
+    #[test]
+    fn strokes_that_end_before_each_other_stay_two() {
+        // A gap that nothing covers, and one that another stroke covers but that lies beside.
+        let apart = painted(&[(2, [0.5, 1.0, 2.5, 1.0], 0.04), (2, [3.0, 1.0, 5.5, 1.0], 0.04)]);
+        assert_eq!(strokes(&apart, &[], &StrokeSettings::default()).1.gaps, 0);
+        let beside = painted(&[
+            (7, [2.5, 0.5, 2.5, 3.5], 0.1),
+            (2, [0.5, 1.0, 2.4, 1.0], 0.04),
+            (2, [2.6, 1.25, 5.5, 1.25], 0.04),
+        ]);
+        assert_eq!(strokes(&beside, &[], &StrokeSettings::default()).1.gaps, 0);
     }
 
     #[test]
