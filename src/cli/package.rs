@@ -1,6 +1,6 @@
 //! `adit package`: everything that is needed to use the map without Adit, in one ZIP file.
 
-use super::run_surface::RunSurface;
+use super::run_surface::read_chart;
 use super::{Console, Exit, Failure, Result};
 use crate::io::{MapFolder, PackageError, PackageFile};
 use crate::map::qgis::{self, ProjectLayer};
@@ -136,15 +136,15 @@ fn draw_back_map(
     legend: &mut Legend,
     layers: &[Layer],
 ) -> std::result::Result<PathBuf, Failure> {
-    let surface = RunSurface::open(&arguments.run)?;
+    let (frame, chart) = read_chart(&arguments.run)?;
     let mut folder = arguments.out.as_os_str().to_owned();
     folder.push(".back-map");
     let folder = PathBuf::from(folder);
     fs::create_dir_all(&folder).map_err(|e| cannot(&folder, &e))?;
     let input = DrawInput {
-        chart: &surface.chart,
+        chart: &chart,
         points: None,
-        frame: &surface.frame,
+        frame: &frame,
         section_offsets_m: None,
         design_offsets_m: None,
         quality: None,

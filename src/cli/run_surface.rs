@@ -22,10 +22,8 @@ pub(super) struct RunSurface {
 impl RunSurface {
     pub(super) fn open(run: &Path) -> Result<Self> {
         let pipeline = Pipeline::load(&need(run, "pipeline.toml")?, &[]).map_err(|e| Failure::new(Exit::Usage, e))?;
-        let (raw, _) = io::ply::read_chart(&need(run, "chart.ply")?).map_err(io_failure)?;
-        let observed = raw.observed.unwrap_or_else(|| vec![true; raw.faces.len()]);
-        let chart = chart_of(raw.vertices, raw.faces, observed, raw.uv.unwrap_or_default())?;
-        Ok(Self { pipeline, frame: raw.frame, chart })
+        let (frame, chart) = read_chart(run)?;
+        Ok(Self { pipeline, frame, chart })
     }
 
     /// The same surface in the local metres of another frame.
@@ -72,6 +70,14 @@ impl RunSurface {
         }
         Ok(directions)
     }
+}
+
+/// The chart of a run and the frame of its local metres, when nothing else of the run is needed.
+pub(super) fn read_chart(run: &Path) -> Result<(ScanFrame, Chart)> {
+    let (raw, _) = io::ply::read_chart(&need(run, "chart.ply")?).map_err(io_failure)?;
+    let observed = raw.observed.unwrap_or_else(|| vec![true; raw.faces.len()]);
+    let chart = chart_of(raw.vertices, raw.faces, observed, raw.uv.unwrap_or_default())?;
+    Ok((raw.frame, chart))
 }
 
 fn chart_of(vertices: Vec<Vec3>, faces: Vec<[u32; 3]>, observed: Vec<bool>, uv: Vec<Vec2>) -> Result<Chart> {

@@ -11,8 +11,8 @@ use std::collections::BTreeMap;
 const MIXED_STEP: f64 = 6.0;
 /// Flat colours are counted in bins of so many grey levels.
 const FLAT_BIN: u8 = 8;
-/// In a resized picture a thin stroke may differ so many times more from the colour it was painted with.
-const RESIZED_SHADE: f64 = 2.0;
+/// In a mixed picture a thin stroke, and in one with few colours a fill, may differ so many times more from the colour it was painted with.
+const MIXED_SHADE: f64 = 2.0;
 /// In a JPEG a thin stroke may differ so many times more from the colour it was painted with.
 const LOSSY_SHADE: f64 = 3.0;
 
@@ -78,6 +78,7 @@ pub(super) fn find_new_classes(
     // White paper is no class on the label map.
     let is_paper = |color: [u8; 3]| is_label_map && color == [255; 3];
 
+    let fill_shade = if rules.noisy && !rules.lossy { MIXED_SHADE * NEW_COLOR } else { NEW_COLOR };
     let mut fills = together(&flat, few);
     fills.sort_by_key(|&(count, color, _)| (std::cmp::Reverse(count), color));
     for (_, color, base) in fills {
@@ -85,7 +86,7 @@ pub(super) fn find_new_classes(
             let (share, residual) = unmix(color, base, c.color, rules);
             share >= 0.2 && residual <= 2.0 * rules.tolerance
         });
-        if !swung && nearest(classes, color) > NEW_COLOR.max(2.0 * rules.tolerance) && !is_paper(color) {
+        if !swung && nearest(classes, color) > (2.0 * rules.tolerance).max(fill_shade) && !is_paper(color) {
             add(classes, color);
         }
     }
@@ -99,8 +100,8 @@ pub(super) fn find_new_classes(
         let shade = NEW_COLOR
             * if rules.lossy {
                 LOSSY_SHADE
-            } else if rules.swing > 0.0 {
-                RESIZED_SHADE
+            } else if rules.mixed {
+                MIXED_SHADE
             } else {
                 1.0
             };

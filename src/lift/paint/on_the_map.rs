@@ -43,8 +43,6 @@ pub(super) fn on_the_map(
         first_centre: sample.placement.chart_from_pixel(Vec2::new(c0 as f64 + 0.5, r0 as f64 + 0.5)),
         ..sample.placement
     };
-    // A smaller picture was sharp when it was made smaller: cubic interpolation keeps that.
-    let cubic = sample.scale() > 1.0 + 1e-6;
     let label_at = |i: usize| -> (Label, bool) {
         let at = (i / out_width + r0) * labels.width + i % out_width + c0;
         if labels.rgba[4 * at + 3] < 128 {
@@ -53,17 +51,17 @@ pub(super) fn on_the_map(
         let uv = placement.chart_from_pixel(Vec2::new((i % out_width) as f64 + 0.5, (i / out_width) as f64 + 0.5));
         let p = sample.own.pixel_from_chart(uv) - Vec2::repeat(0.5);
         let (x, y) = (p.x.floor(), p.y.floor());
-        let (wx, wy) = (weights(p.x - x, cubic), weights(p.y - y, cubic));
+        let (tx, ty) = (p.x - x, p.y - y);
         let mut shares = Totals::default();
         let mut erased = 0.0;
-        for (k, wy) in wy.into_iter().enumerate() {
-            for (j, wx) in wx.into_iter().enumerate() {
+        for (k, wy) in [1.0 - ty, ty].into_iter().enumerate() {
+            for (j, wx) in [1.0 - tx, tx].into_iter().enumerate() {
                 let weight = wx * wy;
                 if weight == 0.0 {
                     continue;
                 }
-                let c = (x + j as f64 - 1.0).clamp(0.0, width as f64 - 1.0) as usize;
-                let r = (y + k as f64 - 1.0).clamp(0.0, height as f64 - 1.0) as usize;
+                let c = (x + j as f64).clamp(0.0, width as f64 - 1.0) as usize;
+                let r = (y + k as f64).clamp(0.0, height as f64 - 1.0) as usize;
                 let n = r * width + c;
                 for (class, share) in paint[n] {
                     shares.add(class, f64::from(share) * weight);
@@ -88,15 +86,6 @@ pub(super) fn on_the_map(
     let undecided = found.iter().filter(|f| f.1).count();
     let labels = found.into_iter().map(|f| f.0).collect();
     (LabelMap { width: out_width, height: out_height, placement, labels }, undecided)
-}
-
-/// Weights of the four pixels around a place at `t` between the second and the third: linear, or cubic (Catmull-Rom).
-fn weights(t: f64, cubic: bool) -> [f64; 4] {
-    if !cubic {
-        return [0.0, 1.0 - t, t, 0.0];
-    }
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (2.0 * t2 - t3 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (4.0 * t2 - 3.0 * t3 + t), 0.5 * (t3 - t2)]
 }
 
 /// Shares of the classes around a place; those of one class count together.
