@@ -27,7 +27,7 @@ adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/ben
 adit compare-methods "$work/bend.laz" --set mesh.spacing_m=0.15 --out "$work/curve" --methods \
     section,arap,relax:straightness=0,relax:straightness=0.1,relax:straightness=0.25,relax:straightness=0.5,relax:straightness=0.75,relax:straightness=0.9,relax:straightness=1
 
-cp "$work/tunnel/comparison.csv" docs/methods/comparison.csv
+sed "s|$work/||g" "$work/tunnel/comparison.csv" > docs/methods/comparison.csv
 cp "$work/bend/comparison.csv" docs/methods/comparison_bend.csv
 cp "$work/curve/comparison.csv" docs/methods/comparison_straightness.csv
 
