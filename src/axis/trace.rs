@@ -213,6 +213,11 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
             let way = skeleton::skeleton(&thicker, ends);
             if way.loop_arm_m.is_none() {
                 (void, skeleton) = (thicker, way);
+                warnings.push(Warning::new(
+                    "thin-walls",
+                    "ways around that lead through walls thinner than a few points' distance, or through holes of their scan, \
+                     were taken for closed; axis.ends follows another way",
+                ));
             }
         }
     }
@@ -661,6 +666,7 @@ mod tests {
         assert!((axis.length() - 24.0).abs() < 1.0, "{}", axis.length());
         assert!((0..=24).all(|s| axis.frame_at(axis.start_chainage() + f64::from(s)).origin.y.abs() < 0.15));
         assert_eq!(summary.branches.len(), 3, "{:?}", summary.branches);
+        assert!(summary.warnings.iter().any(|w| w.code == "thin-walls"), "{:?}", summary.warnings);
         assert!(summary.branches.iter().all(|b| b.side == Side::Left));
     }
 

@@ -237,6 +237,14 @@ fn by_poisson(
     if let Some(k) = &compressed {
         raw.vertices.par_iter_mut().for_each(|v| *v = k.point(v));
         poisson.spacing_along_m = Some(k.cell_along_m());
+        warnings.push(Warning::new(
+            "poisson-of-profiles",
+            format!(
+                "the scan is made of profiles: along the axis cells are {:.2} m long and gaps up to that length are bridged; \
+                 mesh.method = \"section\" suits such scans better",
+                k.cell_along_m()
+            ),
+        ));
     }
     warnings.extend(poisson.warning(settings.spacing_m));
     let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
@@ -497,6 +505,7 @@ mod tests {
         assert!(mesh.vertices().iter().all(|v| (v.y.hypot(v.z) - 2.0).abs() < 0.006));
         let covered = summary.area_m2 / (TAU * 2.0 * 20.0);
         assert!((0.96..1.04).contains(&covered), "{covered}");
+        assert!(summary.warnings.iter().any(|w| w.code == "poisson-of-profiles"), "{:?}", summary.warnings);
         assert!(summary.poisson.unwrap().spacing_along_m.unwrap() > 0.3);
     }
 

@@ -170,19 +170,6 @@ impl Pattern {
         Ok(Self { starts: compact, rows })
     }
 
-    /// From ready columns: `starts` (one more than unknowns) into `rows`; each column begins with its diagonal and ascends.
-    ///
-    /// Panics if the columns are not like that.
-    pub fn from_columns(starts: Vec<u32>, rows: Vec<u32>) -> Self {
-        assert!(starts.first() == Some(&0) && starts.last().is_some_and(|&s| s as usize == rows.len()));
-        let pattern = Self { starts, rows };
-        for j in 0..pattern.unknowns() {
-            let column = pattern.column(j);
-            assert!(column.first() == Some(&(j as u32)) && column.is_sorted_by(|a, b| a < b));
-        }
-        pattern
-    }
-
     /// Number of unknowns.
     pub fn unknowns(&self) -> usize {
         self.starts.len() - 1

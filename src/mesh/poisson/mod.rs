@@ -9,7 +9,7 @@
 //! solved on an octree that is as deep as the points are dense, from coarse to fine (`octree`, `solve`), its level set comes
 //! out of `surface_nets` (`extract`) and is moved onto the points (`fit`), and everything that no point supports goes or is marked (`support`).
 //!
-//! Scans of profiles are compressed along the axis meanwhile (`compressed`).
+//! Scans of profiles are compressed along the axis meanwhile (`compressed`); there, distances along it count less.
 //!
 //! Departures from the papers: trilinear functions, nested so that each level takes the coarser one's values at its rim;
 //! a point is spread at one depth, not between two; the points' own areas come from their density one level up; the
