@@ -4,6 +4,7 @@ mod arrivals;
 mod checkpoint;
 mod error;
 mod explain;
+mod folder_lock;
 mod judge;
 mod known_keys;
 pub mod limits;

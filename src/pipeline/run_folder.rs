@@ -7,6 +7,7 @@
 //! the run folder by a rename. `.adit/journal.jsonl` tells what was begun and finished, and when.
 
 use super::error::Kind;
+use super::folder_lock::FolderLock;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -64,7 +65,7 @@ impl Error {
         }
     }
 
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, path: path.to_owned(), source }
     }
 }
@@ -109,7 +110,7 @@ pub struct RunFolder {
     scratch: PathBuf,
     interrupted: Option<String>,
     // Held until dropped; the operating system frees it when the process dies, so no lock can be stale.
-    _lock: File,
+    _lock: FolderLock,
 }
 
 /// Names the scratch folder of a run folder that has one elsewhere, so that it is removed with it.
@@ -133,27 +134,7 @@ impl RunFolder {
         let private = path.join(PRIVATE);
         fs::create_dir_all(&private).map_err(Error::io("make the run folder", path))?;
         let lock_path = private.join("lock");
-        let mut lock = File::options()
-            .create(true)
-            .truncate(false)
-            .read(true)
-            .write(true)
-            .open(&lock_path)
-            .map_err(Error::io("open the lock", &lock_path))?;
-        match lock.try_lock() {
-            Ok(()) => {}
-            Err(fs::TryLockError::WouldBlock) => {
-                let mut holder = String::new();
-                let _ = lock.read_to_string(&mut holder);
-                let holder = if holder.trim().is_empty() { "another process".into() } else { holder.trim().to_owned() };
-                return Err(Error::Locked { path: path.to_owned(), holder });
-            }
-            Err(fs::TryLockError::Error(source)) => return Err(Error::io("lock", &lock_path)(source)),
-        }
-        let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-        lock.set_len(0)
-            .and_then(|()| write!(lock, "process {} on {}", std::process::id(), host.trim()))
-            .map_err(Error::io("write the lock", &lock_path))?;
+        let lock = FolderLock::take(path, &lock_path)?;
         let scratch = match tmp {
             None => private.clone(),
             Some(tmp) => {

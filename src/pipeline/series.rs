@@ -6,6 +6,7 @@
 use super::arrivals::Scan;
 use super::error::Kind;
 use super::explain;
+use super::folder_lock::FolderLock;
 use super::limits::Status;
 use super::run::explain as explain_run;
 use super::run_folder::{self, read_record, sha256_of, sha256_of_all, sha256_of_bytes, write_atomically};
@@ -14,7 +15,7 @@ use super::settings::Pipeline;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -165,7 +166,7 @@ pub struct Series {
     entries: Vec<Entry>,
     /// Scans that were refused for lack of memory or disk by this process, and when.
     refused: BTreeMap<String, Instant>,
-    _lock: File,
+    _lock: FolderLock,
 }
 
 /// The pipeline of the scans that are being mapped.
@@ -179,33 +180,15 @@ impl Series {
     /// # Errors
     /// [`run_folder::Error`]: locked by another process, or not writable.
     pub fn open(runs: &Path) -> Result<Self, run_folder::Error> {
-        let io = |action: &'static str, path: &Path| {
-            let path = path.to_owned();
-            move |source| run_folder::Error::Io { action, path, source }
-        };
-        fs::create_dir_all(runs).map_err(io("make the folder", runs))?;
+        fs::create_dir_all(runs).map_err(run_folder::Error::io("make the folder", runs))?;
         let lock_path = runs.join(".lock");
-        let lock = File::options()
-            .create(true)
-            .truncate(false)
-            .read(true)
-            .write(true)
-            .open(&lock_path)
-            .map_err(io("open the lock", &lock_path))?;
-        if lock.try_lock().is_err() {
-            let holder = fs::read_to_string(&lock_path).unwrap_or_default();
-            let holder = if holder.is_empty() { "another process".to_owned() } else { holder };
-            return Err(run_folder::Error::Locked { path: runs.to_owned(), holder });
-        }
-        let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-        let holder = format!("process {} on {}", std::process::id(), host.trim());
-        fs::write(&lock_path, holder).map_err(io("write the lock", &lock_path))?;
+        let lock = FolderLock::take(runs, &lock_path)?;
         let ledger = runs.join("runs.json");
         let entries = match fs::read(&ledger) {
             Ok(text) => serde_json::from_slice(&text)
                 .map_err(|e| run_folder::Error::Damaged { path: ledger.clone(), what: e.to_string() })?,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Vec::new(),
-            Err(e) => return Err(io("read", &ledger)(e)),
+            Err(e) => return Err(run_folder::Error::io("read", &ledger)(e)),
         };
         Ok(Self { runs: runs.to_owned(), entries, refused: BTreeMap::new(), _lock: lock })
     }
