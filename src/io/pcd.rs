@@ -78,7 +78,8 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     let path = source.path();
     let header = read_header(source)?;
     // A colour is packed into the bits of one field: it is offered as three more columns.
-    let packed = header.fields.iter().position(|f| ["rgb", "rgba"].contains(&f.name.as_str()) && f.size == 4);
+    let holds_color = |f: &Field| ["rgb", "rgba"].contains(&f.name.as_str()) && f.size == 4 && f.count > 0;
+    let packed = header.fields.iter().position(holds_color);
     let mut names: Vec<String> =
         header.fields.iter().map(|f| if f.count == 1 { f.name.clone() } else { String::new() }).collect();
     let first_packed = names.len();

@@ -312,3 +312,15 @@ fn info_shows_what_reading_refuses() {
     let info = inspect(&path, &Settings::default()).unwrap();
     assert_eq!((info.usable, info.points), (false, 99));
 }
+
+/// Found by fuzzing: the bytes of a colour that occurs no time were looked for behind the last record.
+#[test]
+fn a_pcd_color_field_without_values_is_no_color() {
+    let header = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 0\nWIDTH 2\nHEIGHT 1\n\
+                  POINTS 2\nDATA binary\n";
+    let mut bytes = header.as_bytes().to_vec();
+    bytes.extend([1.0f32, 2.0, 3.0, 4.0, 5.0, 7.0].iter().flat_map(|v| v.to_le_bytes()));
+    let summary = read_named("a.pcd", &bytes).unwrap();
+    assert_eq!(summary.points, 2);
+    assert!(!summary.attributes.contains(&"color"));
+}
