@@ -230,6 +230,7 @@ fn plan_compressed(
             container.record_len
         )));
     }
+    check_items(&vlr).map_err(bad)?;
     let layered = vlr.items()[0].version() >= 3;
     if !(1..=3).contains(&compressor) || (compressor == 3) != layered {
         let cause = format!("LASzip compressor {compressor} with items of version {}", vlr.items()[0].version());
@@ -315,6 +316,34 @@ fn chunk_table(source: &SourceBytes, container: &Container, vlr: &LazVlr) -> Res
         at = end;
     }
     Ok(chunks)
+}
+
+/// Checks the list of LASzip items: a record is one point and, each at most once, what is added to it. The decoder takes an
+/// item's size from its type, the rest of the file is laid out by the stated one.
+fn check_items(vlr: &LazVlr) -> Result<(), String> {
+    let mut seen = Vec::new();
+    for (i, item) in vlr.items().iter().enumerate() {
+        let kind = item.item_type();
+        let size = match kind {
+            LazItemType::Point10 => 20,
+            LazItemType::GpsTime | LazItemType::RGBNIR14 => 8,
+            LazItemType::RGB12 | LazItemType::RGB14 => 6,
+            LazItemType::WavePacket13 | LazItemType::WavePacket14 => 29,
+            LazItemType::Point14 => 30,
+            LazItemType::Byte(n) | LazItemType::Byte14(n) => n,
+        };
+        if item.size() != size {
+            return Err(format!("LASzip item {} is {kind:?} of {} bytes, it must have {size}", i + 1, item.size()));
+        }
+        if matches!(kind, LazItemType::Point10 | LazItemType::Point14) != (i == 0) {
+            return Err(format!("LASzip item {} is {kind:?}: the point must be first, and only there", i + 1));
+        }
+        if seen.contains(&kind) {
+            return Err(format!("LASzip item {} is a second {kind:?}", i + 1));
+        }
+        seen.push(kind);
+    }
+    Ok(())
 }
 
 /// Checks that the layers announced at the head of a layered chunk fit into it, before anything is allocated for them.

@@ -279,6 +279,27 @@ fn damaged_laz_ends_in_an_error_or_points_never_in_a_panic() {
     }
 }
 
+/// Found by fuzzing: a point that is called a colour made the decoder ask for 4 GB.
+#[test]
+fn laz_items_whose_size_does_not_fit_their_type_are_refused() {
+    let good = laz(3000);
+    let id = b"laszip encoded";
+    let record = good.windows(id.len()).position(|w| w == id).unwrap() - 2;
+    // Behind the head of the record and the 32 bytes and the count before the items: types and sizes.
+    let item = |k: usize| record + 54 + 34 + 6 * k;
+    let refusal = |at: usize, value: u16| {
+        let mut bytes = good.clone();
+        bytes[at..at + 2].copy_from_slice(&value.to_le_bytes());
+        read_named("a.laz", &bytes).unwrap_err().to_string()
+    };
+    let kinds: Vec<u16> = (0..2).map(|k| u16::from_le_bytes([good[item(k)], good[item(k) + 1]])).collect();
+    // The point called a colour, and a second point.
+    let color = refusal(item(0), if kinds[0] == 10 { 11 } else { 8 });
+    assert!(color.contains("it must have 6"), "{color}");
+    let point = refusal(item(1), kinds[0]);
+    assert!(point.contains("LASzip item 2 is Point1"), "{point}");
+}
+
 #[test]
 fn a_changed_source_is_not_rewritten() {
     let folder = tempfile::tempdir().unwrap();
