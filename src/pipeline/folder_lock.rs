@@ -2,6 +2,7 @@
 
 use super::run_folder::Error;
 use std::fs::{self, File, TryLockError};
+use std::io::Write;
 use std::path::Path;
 use std::time::Duration;
 
@@ -18,7 +19,7 @@ impl FolderLock {
     /// # Errors
     /// [`Error::Locked`] with the process that holds it, [`Error::Io`].
     pub(super) fn take(folder: &Path, lock_path: &Path) -> Result<Self, Error> {
-        let lock = File::options()
+        let mut lock = File::options()
             .create(true)
             .truncate(false)
             .read(true)
@@ -33,8 +34,9 @@ impl FolderLock {
             Err(TryLockError::Error(source)) => return Err(Error::io("lock", lock_path)(source)),
         }
         let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-        let holder = format!("process {} on {}", std::process::id(), host.trim());
-        fs::write(lock_path, holder).map_err(Error::io("write the lock", lock_path))?;
+        lock.set_len(0)
+            .and_then(|()| write!(lock, "process {} on {}", std::process::id(), host.trim()))
+            .map_err(Error::io("write the lock", lock_path))?;
         Ok(Self(lock))
     }
 }

@@ -6,7 +6,7 @@ use super::header::{Container, STANDARD_LENGTHS, u32_at, u64_at};
 use crate::warning::Warning;
 use laz::laszip::ChunkTable;
 use laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
-use laz::{DecompressionSelection, LazItemType, LazVlr};
+use laz::{DecompressionSelection, LazItemRecordBuilder, LazItemType, LazVlr};
 use std::io::Cursor;
 
 /// Places of the fields in a record of one point format.
@@ -230,7 +230,7 @@ fn plan_compressed(
             container.record_len
         )));
     }
-    check_items(&vlr).map_err(bad)?;
+    check_items(&vlr, container.format).map_err(bad)?;
     let layered = vlr.items()[0].version() >= 3;
     if !(1..=3).contains(&compressor) || (compressor == 3) != layered {
         let cause = format!("LASzip compressor {compressor} with items of version {}", vlr.items()[0].version());
@@ -318,30 +318,22 @@ fn chunk_table(source: &SourceBytes, container: &Container, vlr: &LazVlr) -> Res
     Ok(chunks)
 }
 
-/// Checks the list of LASzip items: a record is one point and, each at most once, what is added to it. The decoder takes an
-/// item's size from its type, the rest of the file is laid out by the stated one.
-fn check_items(vlr: &LazVlr) -> Result<(), String> {
-    let mut seen = Vec::new();
+/// Checks that the LASzip items are those of the point format, and then extra bytes only; that none is missing follows from
+/// the length of a record. The decoder goes by the types of the items, everything else by the stated sizes and the format.
+fn check_items(vlr: &LazVlr, format: u8) -> Result<(), String> {
+    let standard = LazItemRecordBuilder::default_for_point_format_id(format, 0).map_err(|e| e.to_string())?;
     for (i, item) in vlr.items().iter().enumerate() {
-        let kind = item.item_type();
-        let size = match kind {
-            LazItemType::Point10 => 20,
-            LazItemType::GpsTime | LazItemType::RGBNIR14 => 8,
-            LazItemType::RGB12 | LazItemType::RGB14 => 6,
-            LazItemType::WavePacket13 | LazItemType::WavePacket14 => 29,
-            LazItemType::Point14 => 30,
-            LazItemType::Byte(n) | LazItemType::Byte14(n) => n,
+        let (kind, size) = (item.item_type(), item.size());
+        let fits = match standard.get(i) {
+            Some(due) => (kind, size) == (due.item_type(), due.size()),
+            None => matches!(kind, LazItemType::Byte(_) | LazItemType::Byte14(_)),
         };
-        if item.size() != size {
-            return Err(format!("LASzip item {} is {kind:?} of {} bytes, it must have {size}", i + 1, item.size()));
+        if !fits {
+            return Err(format!(
+                "LASzip item {} is {kind:?} of {size} bytes, which point format {format} has not there",
+                i + 1
+            ));
         }
-        if matches!(kind, LazItemType::Point10 | LazItemType::Point14) != (i == 0) {
-            return Err(format!("LASzip item {} is {kind:?}: the point must be first, and only there", i + 1));
-        }
-        if seen.contains(&kind) {
-            return Err(format!("LASzip item {} is a second {kind:?}", i + 1));
-        }
-        seen.push(kind);
     }
     Ok(())
 }

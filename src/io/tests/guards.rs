@@ -281,23 +281,22 @@ fn damaged_laz_ends_in_an_error_or_points_never_in_a_panic() {
 
 /// Found by fuzzing: a point that is called a colour made the decoder ask for 4 GB.
 #[test]
-fn laz_items_whose_size_does_not_fit_their_type_are_refused() {
+fn laz_items_that_are_not_those_of_the_point_format_are_refused() {
     let good = laz(3000);
     let id = b"laszip encoded";
     let record = good.windows(id.len()).position(|w| w == id).unwrap() - 2;
-    // Behind the head of the record and the 32 bytes and the count before the items: types and sizes.
+    // Behind the 54 bytes of the record's head and the 34 before its items, of 6 bytes: type, size, version.
     let item = |k: usize| record + 54 + 34 + 6 * k;
-    let refusal = |at: usize, value: u16| {
-        let mut bytes = good.clone();
-        bytes[at..at + 2].copy_from_slice(&value.to_le_bytes());
-        read_named("a.laz", &bytes).unwrap_err().to_string()
-    };
-    let kinds: Vec<u16> = (0..2).map(|k| u16::from_le_bytes([good[item(k)], good[item(k) + 1]])).collect();
-    // The point called a colour, and a second point.
-    let color = refusal(item(0), if kinds[0] == 10 { 11 } else { 8 });
-    assert!(color.contains("it must have 6"), "{color}");
-    let point = refusal(item(1), kinds[0]);
-    assert!(point.contains("LASzip item 2 is Point1"), "{point}");
+    let point = [good[item(0)], good[item(0) + 1]];
+    let color = 11u16.to_le_bytes();
+    for (at, value, told) in [
+        (item(0), color, "LASzip item 1 is RGB14 of 30 bytes"),
+        (item(1), point, "LASzip item 2 is Point14 of 6 bytes"),
+        (item(2), color, "LASzip item 3 is RGB14 of 4 bytes"),
+    ] {
+        let refusal = read_named("a.laz", &with(good.clone(), at, &value)).unwrap_err().to_string();
+        assert!(refusal.contains(told), "{told}: {refusal}");
+    }
 }
 
 #[test]
