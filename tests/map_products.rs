@@ -87,7 +87,8 @@ fn read_chart(path: &Path) -> (Vec<[f64; 5]>, Vec<[u32; 3]>) {
 fn pixels_lead_back_to_the_scan() {
     let map = run().join("map");
     let (DecodingResult::F32(xyz), width, metadata) = read_tiff(&map.join("xyz.tif")) else { panic!("floats") };
-    let (DecodingResult::F64(place), ..) = read_tiff(&map.join("surface_point.tif")) else { panic!("floats") };
+    let (DecodingResult::F32(place), ..) = read_tiff(&map.join("surface_point.tif")) else { panic!("floats") };
+    let place: Vec<f64> = place.into_iter().map(f64::from).collect();
     let offset = |band: usize| -> f64 {
         let key = format!("<Item name=\"OFFSET\" sample=\"{band}\" role=\"offset\">");
         metadata.split(&key).nth(1).unwrap().split('<').next().unwrap().parse().unwrap()

@@ -1,11 +1,11 @@
 //! The `map` folder of a run: a picture and a GeoTIFF of every layer, world files, and the palette of the labels.
 
-use super::geotiff::{GeoTiffWriter, RawTile, no_data_tile, sample_bytes};
+use super::geotiff::{GeoTiffWriter, Tile, no_data_tile};
 use super::png::PngWriter;
 use super::tile_pyramid::{self, TilePyramid};
 use super::world_file;
 use crate::map::{
-    Grid, Layer, LayerDescription, Legend, Look, PaletteEntry, Picture, Piece, Placement, Samples, Sink, TILE_PX,
+    Block, Grid, Layer, LayerDescription, Legend, Look, PaletteEntry, Picture, Piece, Placement, Sink, TILE_PX,
 };
 use crate::numeric::Vec2;
 use rayon::prelude::*;
@@ -205,18 +205,19 @@ impl MapFolder {
     }
 
     fn finish_map(&mut self) -> Result<(), Error> {
-        for files in &mut self.layers {
+        let folder = &self.folder;
+        self.layers.par_iter_mut().try_for_each(|files| {
             let name = files.description.layer.name();
             if let Some(raster) = files.raster.take() {
-                let path = self.folder.join(format!("{name}.tif"));
+                let path = folder.join(format!("{name}.tif"));
                 raster.finish().map_err(|source| Error::Io { path, source })?;
             }
             if let Some(picture) = files.picture.take() {
-                let path = self.folder.join(format!("{name}.png"));
+                let path = folder.join(format!("{name}.png"));
                 picture.writer.finish().map_err(|source| Error::Io { path, source })?;
             }
-        }
-        Ok(())
+            Ok(())
+        })
     }
 }
 
@@ -263,6 +264,11 @@ impl PictureRows {
         }
         for (line, &row) in rows.iter().enumerate() {
             let from = (middle(row, grid.height()) - rect.row) * rect.width;
+            if reduction == 1 {
+                self.rows[line * self.width + rect.column..][..rect.width]
+                    .copy_from_slice(&pixels[from..][..rect.width]);
+                continue;
+            }
             for x in (x0..self.width).take_while(|&x| middle(x, grid.width()) < rect.column + rect.width) {
                 self.rows[line * self.width + x] = pixels[from + middle(x, grid.width()) - rect.column];
             }
@@ -291,33 +297,18 @@ fn picture_placement(grid: &Grid, reduction: usize) -> Placement {
 }
 
 /// Cuts a piece of a layer into tiles, padded with NoData.
-fn tiles_of(description: &LayerDescription, piece: &Piece, layer: usize) -> Vec<RawTile> {
+fn tiles_of(description: &LayerDescription, piece: &Piece, layer: usize) -> Vec<Tile> {
     let rect = piece.rect;
-    let bytes = to_bytes(&piece.layers[layer]);
-    let pixel = sample_bytes(description.sample) * description.bands.len();
     (0..rect.width.div_ceil(TILE_PX))
         .map(|t| {
-            let width = TILE_PX.min(rect.width - t * TILE_PX);
-            let mut tile = no_data_tile(description, TILE_PX);
-            for y in 0..rect.height {
-                let from = (y * rect.width + t * TILE_PX) * pixel;
-                let to = y * TILE_PX * pixel;
-                tile[to..to + width * pixel].copy_from_slice(&bytes[from..from + width * pixel]);
-            }
-            RawTile { column: rect.column / TILE_PX + t, row: rect.row / TILE_PX, bytes: tile }
+            let size = [TILE_PX.min(rect.width - t * TILE_PX), rect.height];
+            let from = Block { x: t * TILE_PX, y: 0, picture_width: rect.width };
+            let to = Block { x: 0, y: 0, picture_width: TILE_PX };
+            let mut samples = no_data_tile(description, TILE_PX);
+            samples.copy_block(to, &piece.layers[layer], from, size, description.bands.len());
+            Tile { column: rect.column / TILE_PX + t, row: rect.row / TILE_PX, samples }
         })
         .collect()
-}
-
-/// Little-endian bytes of samples.
-fn to_bytes(samples: &Samples) -> Vec<u8> {
-    match samples {
-        Samples::U8(v) => v.clone(),
-        Samples::U16(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
-        Samples::U32(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
-        Samples::F32(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
-        Samples::F64(v) => v.iter().flat_map(|x| x.to_le_bytes()).collect(),
-    }
 }
 
 #[cfg(test)]

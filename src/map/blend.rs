@@ -26,6 +26,7 @@ use super::grid::{Grid, PixelRect};
 use super::sampling::{ScatterIndex, Spacing};
 use crate::cloud::{Cloud, Label};
 use crate::numeric::Vec2;
+use rayon::prelude::*;
 
 /// Half axis of the kernel in local point spacings; the weight has a standard deviation of a third of it.
 const KERNEL_SPACINGS: f64 = 1.6;
@@ -37,6 +38,8 @@ const FULL_CERTAINTY: f32 = 0.1;
 const OBSERVED_SPACINGS: f64 = 2.0;
 /// ... and always up to this many pixels.
 const OBSERVED_MIN_PX: f64 = 1.5;
+/// The local spacing counts for squares of so many pixels.
+const SPACING_PX: usize = 8;
 /// Automatic filling distance in typical spacings, and its bounds in metres.
 const FILL_SPACINGS: f64 = 4.0;
 const FILL_BOUNDS_M: (f64, f64) = (0.05, 1.0);
@@ -85,21 +88,86 @@ pub struct BlendedTile {
     pub labels: Vec<Label>,
 }
 
-/// The points that colour the map.
+/// The points that colour the map, with their attributes in the order of the index.
 #[derive(Debug)]
-pub struct Scatter<'a> {
+pub struct Scatter {
     /// Points on the surface, sorted.
-    pub index: ScatterIndex<'a>,
+    pub index: ScatterIndex,
     /// Their spacing.
     pub spacing: Spacing,
-    /// Their attributes.
-    pub cloud: &'a Cloud,
-    /// Whether colours are to be blended.
+    /// Red, green, blue, intensity; empty with neither colours nor intensities.
+    values: Vec<[u16; 4]>,
+    labels: Vec<Label>,
+    has: Wanted,
+}
+
+/// Which attributes of the points are to be drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Colours.
     pub colors: bool,
-    /// Whether intensities are to be blended.
+    /// Intensities.
     pub intensities: bool,
-    /// Whether labels are to be drawn.
+    /// Labels.
     pub labels: bool,
+}
+
+impl Wanted {
+    fn values(self) -> bool {
+        self.colors || self.intensities
+    }
+
+    fn and(self, other: Self) -> Self {
+        Self {
+            colors: self.colors && other.colors,
+            intensities: self.intensities && other.intensities,
+            labels: self.labels && other.labels,
+        }
+    }
+}
+
+impl Scatter {
+    /// Gathers the attributes of the points in the index; those that the cloud does not have are not drawn.
+    pub fn new(index: ScatterIndex, spacing: Spacing, cloud: &Cloud, wanted: Wanted) -> Self {
+        let attributes = cloud.attributes();
+        let colors = attributes.colors.as_deref().filter(|_| wanted.colors);
+        let intensities = attributes.intensities.as_deref().filter(|_| wanted.intensities);
+        let value = |&point: &u32| {
+            let [r, g, b] = colors.map_or([0; 3], |c| c[point as usize]);
+            [r, g, b, intensities.map_or(0, |i| i[point as usize])]
+        };
+        let has = Wanted {
+            colors: colors.is_some(),
+            intensities: intensities.is_some(),
+            labels: wanted.labels && attributes.labels.is_some(),
+        };
+        let values = if has.values() { index.points().par_iter().map(value).collect() } else { Vec::new() };
+        let labels = attributes.labels.as_deref().filter(|_| wanted.labels);
+        let labels = labels.map_or(Vec::new(), |l| index.points().par_iter().map(|&i| l[i as usize]).collect());
+        Self { index, spacing, values, labels, has }
+    }
+}
+
+/// Weighted sums of the values near each pixel of the surroundings, or their means.
+struct Sums {
+    /// Red, green, blue, intensity.
+    values: Vec<[f32; 4]>,
+    weights: Vec<f32>,
+}
+
+impl Sums {
+    fn new(pixels: usize) -> Self {
+        Self { values: vec![[0.0; 4]; pixels], weights: vec![0.0; pixels] }
+    }
+
+    /// Turns sums into means; `certainty` makes the weight of a mean from the sum of the weights.
+    fn average(&mut self, certainty: impl Fn(f32) -> f32) {
+        for (value, weight) in self.values.iter_mut().zip(&mut self.weights).filter(|(_, w)| **w > 0.0) {
+            let w = *weight;
+            value.iter_mut().for_each(|x| *x /= w);
+            *weight = certainty(w);
+        }
+    }
 }
 
 /// The rectangle around a tile in which its points lie; may reach over the edge of the grid.
@@ -112,65 +180,90 @@ struct Surroundings {
     inner: (usize, usize),
 }
 
+/// An ellipse around a pixel.
+struct Ellipse {
+    inverse_half_axes: [f64; 2],
+}
+
+impl Ellipse {
+    fn new(half_axes_px: [f64; 2]) -> Self {
+        Self { inverse_half_axes: half_axes_px.map(|a| 1.0 / a) }
+    }
+
+    fn holds(&self, (dx, dy): (f64, f64)) -> bool {
+        let [a, b] = self.inverse_half_axes;
+        (dx * a).powi(2) + (dy * b).powi(2) <= 1.0
+    }
+}
+
 /// Pull-push reduces by these factors in u and v from level to level.
 type Factors = [usize; 2];
 
-/// Blends the values of the scan points on those pixels of `rect` that are `wanted` (because there is surface).
+/// Blends the `wanted` attributes of the scan points on those pixels of `rect` that are `on_surface`.
 pub fn blend(
     scatter: &Scatter,
+    wanted: Wanted,
     grid: &Grid,
     reach: &Reach,
     rect: PixelRect,
-    wanted: impl Fn(usize) -> bool,
+    on_surface: impl Fn(usize) -> bool,
 ) -> BlendedTile {
+    let drawn = wanted.and(scatter.has);
     let cell = grid.cell_m();
     let pyramid = pyramid_factors(reach, cell);
     let margin = [0, 1].map(|d| ((reach.kernel_m[d].max(reach.fill_m[d]) / cell).ceil() as usize) + 2);
-    let around = Surroundings::new(rect, margin);
-    let mut sums = vec![[0f32; 5]; around.width * around.height];
-    let seeds = splat(scatter, grid, &around, &mut sums);
-    let nearest = nearest_seeds(&seeds, &around, rect, reach, cell);
+    let has_values = drawn.values();
+    let around = if has_values {
+        // The pyramid needs room around, aligned so that its cells are the same for every tile.
+        let total = pyramid.iter().fold([1, 1], |t: Factors, f| [t[0] * f[0], t[1] * f[1]]);
+        Surroundings::aligned(rect, [0, 1].map(|d| margin[d].max(2 * total[d])), total)
+    } else {
+        Surroundings::new(rect, margin)
+    };
+    let mut sums = Sums::new(if has_values { around.width * around.height } else { 0 });
+    let seeds = splat(scatter, drawn, grid, &around, &mut sums);
+    let nearest = nearest_seeds(&seeds, &around, margin, rect, reach, cell);
 
     let mut support = vec![Support::None; rect.len()];
     let mut needs_filling = false;
-    for y in 0..rect.height {
-        for x in 0..rect.width {
-            let i = y * rect.width + x;
-            let Some((dx, dy)) = nearest.offset(i).filter(|_| wanted(i)) else { continue };
-            let (du, dv) = (dx * cell, dy * cell);
-            let centre = Vec2::new((rect.column + x) as f64 + 0.5, (rect.row + y) as f64 + 0.5);
-            let local = scatter.spacing.at(grid.chart_from_pixel(centre));
-            let within = |limit: [f64; 2]| (du / limit[0]).powi(2) + (dv / limit[1]).powi(2) <= 1.0;
-            support[i] = if within(local.map(|s| (OBSERVED_SPACINGS * s).max(OBSERVED_MIN_PX * cell))) {
-                Support::Observed
-            } else if within(reach.fill_m) {
-                Support::Filled
-            } else {
-                continue;
-            };
-            let at = (y + around.inner.1) * around.width + x + around.inner.0;
-            needs_filling |= sums[at][4] < FULL_CERTAINTY;
+    // Squares of the grid, not of the tile: a pixel must not know in which tile it lies.
+    let squares = |start: usize, length: usize| (start / SPACING_PX * SPACING_PX..start + length).step_by(SPACING_PX);
+    let filled = Ellipse::new(reach.fill_m.map(|f| f / cell));
+    for row in squares(rect.row, rect.height) {
+        for column in squares(rect.column, rect.width) {
+            let centre = Vec2::new(column as f64, row as f64).add_scalar(0.5 * SPACING_PX as f64);
+            let spacing = scatter.spacing.at(grid.chart_from_pixel(centre));
+            let observed = Ellipse::new(spacing.map(|s| (OBSERVED_SPACINGS * s / cell).max(OBSERVED_MIN_PX)));
+            for y in row.max(rect.row) - rect.row..(row + SPACING_PX - rect.row).min(rect.height) {
+                for x in column.max(rect.column) - rect.column..(column + SPACING_PX - rect.column).min(rect.width) {
+                    let i = y * rect.width + x;
+                    let Some(offset) = nearest.offset(x, y).filter(|_| on_surface(i)) else { continue };
+                    support[i] = if observed.holds(offset) {
+                        Support::Observed
+                    } else if filled.holds(offset) {
+                        Support::Filled
+                    } else {
+                        continue;
+                    };
+                    needs_filling |= has_values && sums.weights[around.inside(x, y)] < FULL_CERTAINTY;
+                }
+            }
         }
     }
-    let wants_values = scatter.colors || scatter.intensities;
-    if wants_values && needs_filling {
-        // The pyramid needs more room, aligned so that its cells are the same for every tile.
-        let total = pyramid.iter().fold([1, 1], |t: Factors, f| [t[0] * f[0], t[1] * f[1]]);
-        let wide = Surroundings::aligned(rect, [2 * total[0], 2 * total[1]], total);
-        let mut wide_sums = vec![[0f32; 5]; wide.width * wide.height];
-        splat(scatter, grid, &wide, &mut wide_sums);
-        pull_push(&mut wide_sums, wide.width, wide.height, &pyramid);
-        return collect(scatter, rect, &wide, &wide_sums, support, &nearest, &seeds);
+    if needs_filling {
+        pull_push(&mut sums, around.width, around.height, &pyramid);
+    } else {
+        sums.average(|_| 1.0);
     }
-    sums.iter_mut().filter(|s| s[4] > 0.0).for_each(|s| {
-        let w = s[4];
-        s[..4].iter_mut().for_each(|x| *x /= w);
-        s[4] = 1.0;
-    });
-    collect(scatter, rect, &around, &sums, support, &nearest, &seeds)
+    collect(drawn, rect, &around, &sums, support, &nearest, &seeds)
 }
 
 impl Surroundings {
+    /// Where pixel (x, y) of the tile lies in the surroundings.
+    fn inside(&self, x: usize, y: usize) -> usize {
+        (y + self.inner.1) * self.width + x + self.inner.0
+    }
+
     fn new(rect: PixelRect, margin: [usize; 2]) -> Self {
         Self {
             column: rect.column as i64 - margin[0] as i64,
@@ -203,71 +296,73 @@ struct Seeds {
     labels: Vec<Label>,
 }
 
-/// Adds every near point to the sums (red, green, blue, intensity, weight) of the pixels under its kernel.
-fn splat(scatter: &Scatter, grid: &Grid, around: &Surroundings, sums: &mut [[f32; 5]]) -> Seeds {
+/// Adds every near point to the sums of the pixels under its kernel.
+fn splat(scatter: &Scatter, drawn: Wanted, grid: &Grid, around: &Surroundings, sums: &mut Sums) -> Seeds {
     let cell = grid.cell_m();
-    let attributes = scatter.cloud.attributes();
-    let colors = attributes.colors.as_deref().filter(|_| scatter.colors);
-    let intensities = attributes.intensities.as_deref().filter(|_| scatter.intensities);
-    let labels = attributes.labels.as_deref().filter(|_| scatter.labels);
     let reach = scatter.spacing.greatest().map(|s| KERNEL_SPACINGS * s / cell + KERNEL_MIN_PX);
     let corner = Vec2::new(around.column as f64, around.row as f64);
     let size = Vec2::new(around.width as f64, around.height as f64);
     let border = Vec2::new(reach[0], reach[1]);
     let a = grid.chart_from_pixel(corner - border);
     let b = grid.chart_from_pixel(corner + size + border);
-    let mut seeds = Seeds { holds_point: vec![false; sums.len()], labels: Vec::new() };
+    let mut seeds = Seeds { holds_point: vec![false; around.width * around.height], labels: Vec::new() };
     let mut votes: Vec<(u32, Label, f32)> = Vec::new();
-    let wants_values = colors.is_some() || intensities.is_some();
-    scatter.index.for_each_near(a.inf(&b), a.sup(&b), |point, uv| {
-        let p = grid.pixel_from_chart(uv) - corner;
-        if p.x >= 0.0 && p.y >= 0.0 && p.x < size.x && p.y < size.y {
-            let pixel = p.y as usize * around.width + p.x as usize;
-            seeds.holds_point[pixel] = true;
-            if let Some(labels) = labels {
-                let centre = Vec2::new(p.x.floor() + 0.5, p.y.floor() + 0.5);
-                votes.push((pixel as u32, labels[point as usize], (p - centre).norm_squared() as f32));
-            }
-        }
-        if !wants_values {
-            return;
-        }
-        let spacing = scatter.spacing.at(uv);
-        let half = spacing.map(|s| (KERNEL_SPACINGS * s / cell).max(KERNEL_MIN_PX));
-        let x0 = (p.x - half[0] - 0.5).ceil().max(0.0);
-        let x1 = (p.x + half[0] - 0.5).floor().min(size.x - 1.0);
-        let y0 = (p.y - half[1] - 0.5).ceil().max(0.0);
-        let y1 = (p.y + half[1] - 0.5).floor().min(size.y - 1.0);
-        if x0 > x1 || y0 > y1 {
-            return;
-        }
-        let c = colors.map_or([0.0; 3], |c| c[point as usize].map(f32::from));
-        let intensity = intensities.map_or(0.0, |i| f32::from(i[point as usize]));
-        let (sx, sy) = ((1.0 / half[0]) as f32, (1.0 / half[1]) as f32);
-        for y in y0 as usize..=y1 as usize {
-            let dy = (y as f64 + 0.5 - p.y) as f32 * sy;
-            let rest = 1.0 - dy * dy;
-            let line = &mut sums[y * around.width..(y + 1) * around.width];
-            let mut dx = (x0 + 0.5 - p.x) as f32 * sx;
-            for sum in &mut line[x0 as usize..=x1 as usize] {
-                let t = rest - dx * dx;
-                if t > 0.0 {
-                    let w = t * t * t;
-                    sum[0] += w * c[0];
-                    sum[1] += w * c[1];
-                    sum[2] += w * c[2];
-                    sum[3] += w * intensity;
-                    sum[4] += w;
+    for bucket in scatter.index.buckets_near(a.inf(&b), a.sup(&b)) {
+        // The spacing changes slowly: once for all points of a bucket.
+        let half = scatter.spacing.at(bucket.centre).map(|s| (KERNEL_SPACINGS * s / cell).max(KERNEL_MIN_PX));
+        for member in bucket.members {
+            let p = grid.pixel_from_chart(scatter.index.places()[member]) - corner;
+            if p.x >= 0.0 && p.y >= 0.0 && p.x < size.x && p.y < size.y {
+                let (x, y) = (p.x as usize, p.y as usize);
+                let pixel = y * around.width + x;
+                seeds.holds_point[pixel] = true;
+                if drawn.labels {
+                    let label = scatter.labels[member];
+                    let centre = Vec2::new(x as f64 + 0.5, y as f64 + 0.5);
+                    votes.push((pixel as u32, label, (p - centre).norm_squared() as f32));
                 }
-                dx += sx;
+            }
+            if drawn.values() {
+                add(scatter.values[member].map(f32::from), p, half, around, sums);
             }
         }
-    });
-    if labels.is_some() {
-        seeds.labels = vec![0; sums.len()];
+    }
+    if drawn.labels {
+        seeds.labels = vec![0; seeds.holds_point.len()];
         decide(&mut votes, &mut seeds.labels);
     }
     seeds
+}
+
+/// Adds a value at `p` (pixels of the surroundings) to the pixels under a kernel with these half axes.
+fn add(value: [f32; 4], p: Vec2, half: [f64; 2], around: &Surroundings, sums: &mut Sums) {
+    // The first pixel whose centre is not left of `low`, and the one after the last that is not right of `high`.
+    let pixels = |low: f64, high: f64, size: usize| {
+        let first = (low + 0.5).max(0.0) as usize;
+        let end = (high + 0.5).clamp(0.0, size as f64) as usize;
+        first..end
+    };
+    let columns = pixels(p.x - half[0], p.x + half[0], around.width);
+    let (sx, sy) = ((1.0 / half[0]) as f32, (1.0 / half[1]) as f32);
+    if columns.is_empty() {
+        return;
+    }
+    let first = (columns.start as f64 + 0.5 - p.x) as f32 * sx;
+    for y in pixels(p.y - half[1], p.y + half[1], around.height) {
+        let dy = (y as f64 + 0.5 - p.y) as f32 * sy;
+        let rest = 1.0 - dy * dy;
+        let line = y * around.width + columns.start..y * around.width + columns.end;
+        let mut dx = first;
+        for (sum, weight) in sums.values[line.clone()].iter_mut().zip(&mut sums.weights[line]) {
+            let t = (rest - dx * dx).max(0.0);
+            let w = t * t * t;
+            for k in 0..4 {
+                sum[k] += w * value[k];
+            }
+            *weight += w;
+            dx += sx;
+        }
+    }
 }
 
 /// The label of most points in each pixel; between equals the one nearest to the pixel's centre.
@@ -287,100 +382,105 @@ fn decide(votes: &mut [(u32, Label, f32)], labels: &mut [Label]) {
 
 /// For each pixel of the tile the nearest pixel of the surroundings that holds a point.
 struct Nearest {
-    /// Index in the surroundings, or `u32::MAX`.
-    seed: Vec<u32>,
-    rect: PixelRect,
+    /// Column and row in the surroundings, or `NO_SEED`.
+    seed: Vec<(u32, u32)>,
+    tile_width: usize,
     inner: (usize, usize),
-    width: usize,
 }
 
+/// No pixel near holds a point.
+const NO_SEED: (u32, u32) = (u32::MAX, u32::MAX);
+
 impl Nearest {
-    /// Pixels to the right and down from pixel `i` of the tile to its seed.
-    fn offset(&self, i: usize) -> Option<(f64, f64)> {
-        let seed = self.seed[i];
-        (seed != u32::MAX).then(|| {
-            let (sx, sy) = (seed as usize % self.width, seed as usize / self.width);
-            let (x, y) = (i % self.rect.width + self.inner.0, i / self.rect.width + self.inner.1);
-            (sx as f64 - x as f64, sy as f64 - y as f64)
-        })
+    /// Pixels to the right and down from pixel (x, y) of the tile to its seed.
+    fn offset(&self, x: usize, y: usize) -> Option<(f64, f64)> {
+        let (sx, sy) = self.seed[y * self.tile_width + x];
+        let step = |seed: u32, at: usize, inner: usize| f64::from(seed) - (at + inner) as f64;
+        ((sx, sy) != NO_SEED).then(|| (step(sx, x, self.inner.0), step(sy, y, self.inner.1)))
     }
 }
 
-/// Exact nearest seed in the metric of the typical spacing: nearest in each column first, then the lower envelope of
-/// parabolas along each row.
-fn nearest_seeds(seeds: &Seeds, around: &Surroundings, rect: PixelRect, reach: &Reach, cell: f64) -> Nearest {
-    let (width, height) = (around.width, around.height);
+/// Exact nearest seed within `margin` pixels, in the metric of the typical spacing: nearest in each column first, then
+/// the lower envelope of parabolas along each row.
+fn nearest_seeds(
+    seeds: &Seeds,
+    around: &Surroundings,
+    margin: [usize; 2],
+    rect: PixelRect,
+    reach: &Reach,
+    cell: f64,
+) -> Nearest {
+    let width = around.width;
+    let (left, top) = around.inner;
+    let columns = left - margin[0]..left + rect.width + margin[0];
+    let rows = top - margin[1]..top + rect.height + margin[1];
     // Metric: one pixel along u is `su`, one along v is `sv`.
     let [su, sv] = reach.spacing_m.map(|s| cell / s);
-    let first = around.inner.1;
     // Vertical pass: row of the nearest seed in the same column, from above and from below.
-    let mut row_of = vec![u32::MAX; width * rect.height];
-    let mut last = vec![u32::MAX; width];
-    for y in 0..first + rect.height {
-        for x in 0..width {
-            if seeds.holds_point[y * width + x] {
-                last[x] = y as u32;
-            }
-            if y >= first {
-                row_of[(y - first) * width + x] = last[x];
-            }
+    let across = columns.len();
+    let mut row_of = vec![u32::MAX; across * rect.height];
+    let holds = |y: usize| &seeds.holds_point[y * width + columns.start..y * width + columns.end];
+    let mut last = vec![u32::MAX; across];
+    for y in rows.start..top + rect.height {
+        for (last, _) in last.iter_mut().zip(holds(y)).filter(|(_, holds)| **holds) {
+            *last = y as u32;
+        }
+        if y >= top {
+            row_of[(y - top) * across..][..across].copy_from_slice(&last);
         }
     }
     last.fill(u32::MAX);
-    for y in (first..height).rev() {
-        for x in 0..width {
-            if seeds.holds_point[y * width + x] {
-                last[x] = y as u32;
-            }
-            if y < first + rect.height && last[x] != u32::MAX {
-                let slot = &mut row_of[(y - first) * width + x];
-                if *slot == u32::MAX || (last[x] as usize - y) < (y - *slot as usize) {
-                    *slot = last[x];
+    for y in (top..rows.end).rev() {
+        for (last, _) in last.iter_mut().zip(holds(y)).filter(|(_, holds)| **holds) {
+            *last = y as u32;
+        }
+        if y < top + rect.height {
+            let line = &mut row_of[(y - top) * across..][..across];
+            // Between equals the one above; "none" is beyond every row.
+            let from_above = |slot: u32| if slot == u32::MAX { u32::MAX } else { y as u32 - slot };
+            for (slot, &last) in line.iter_mut().zip(&last) {
+                if last != u32::MAX && last - (y as u32) < from_above(*slot) {
+                    *slot = last;
                 }
             }
         }
     }
-    let mut seed = vec![u32::MAX; rect.len()];
-    let mut hull: Vec<usize> = Vec::with_capacity(width);
-    let mut from: Vec<f64> = Vec::with_capacity(width);
+    let mut seed = vec![NO_SEED; rect.len()];
+    // Of each parabola of the envelope: its column, its height there, and from where on it is the lowest.
+    let mut hull: Vec<(usize, f64, f64)> = Vec::with_capacity(across);
+    // 1 / (2 su^2 distance): a division for each comparison would take most of the time.
+    let inverse: Vec<f64> = (0..across).map(|distance| 0.5 / (su * su * distance as f64)).collect();
     for y in 0..rect.height {
-        let line = &row_of[y * width..(y + 1) * width];
-        let height_of = |x: usize| {
-            let d = (line[x] as f64 - (y + first) as f64) * sv;
-            d * d
-        };
+        let line = &row_of[y * across..(y + 1) * across];
         hull.clear();
-        from.clear();
-        for x in (0..width).filter(|&x| line[x] != u32::MAX) {
-            let f = height_of(x);
+        for (x, &row) in line.iter().enumerate().filter(|(_, row)| **row != u32::MAX) {
+            let d = (f64::from(row) - (y + top) as f64) * sv;
+            let height = d * d;
             let mut start = f64::NEG_INFINITY;
-            while let Some(&h) = hull.last() {
-                // Where the parabola at x gets below the one at h.
-                start = (f - height_of(h) + su * su * ((x * x) as f64 - (h * h) as f64))
-                    / (2.0 * su * su * (x as f64 - h as f64));
-                if start > from[hull.len() - 1] {
+            while let Some(&(other, other_height, other_start)) = hull.last() {
+                start = (height - other_height) * inverse[x - other] + 0.5 * (x + other) as f64;
+                if start > other_start {
                     break;
                 }
                 hull.pop();
-                from.pop();
                 start = f64::NEG_INFINITY;
             }
-            hull.push(x);
-            from.push(start);
+            hull.push((x, height, start));
         }
         if hull.is_empty() {
             continue;
         }
         let mut k = 0;
-        for x in 0..rect.width {
-            let at = (x + around.inner.0) as f64;
-            while k + 1 < hull.len() && from[k + 1] <= at {
+        for (x, slot) in seed[y * rect.width..(y + 1) * rect.width].iter_mut().enumerate() {
+            let at = (x + margin[0]) as f64;
+            while k + 1 < hull.len() && hull[k + 1].2 <= at {
                 k += 1;
             }
-            seed[y * rect.width + x] = line[hull[k]] * width as u32 + hull[k] as u32;
+            let column = hull[k].0;
+            *slot = ((column + columns.start) as u32, line[column]);
         }
     }
-    Nearest { seed, rect, inner: around.inner, width }
+    Nearest { seed, tile_width: rect.width, inner: around.inner }
 }
 
 /// Reduction from level to level until a cell spans the filling distance: first only along the sparser direction,
@@ -405,62 +505,54 @@ fn pyramid_factors(reach: &Reach, cell: f64) -> Vec<Factors> {
 }
 
 /// Turns sums into values with certainty and fills uncertain pixels from coarser and coarser means.
-fn pull_push(sums: &mut [[f32; 5]], width: usize, height: usize, factors: &[Factors]) {
-    for s in sums.iter_mut() {
-        let w = s[4];
-        if w > 0.0 {
-            s[..4].iter_mut().for_each(|x| *x /= w);
-            s[4] = (w / FULL_CERTAINTY).min(1.0);
-        }
-    }
+fn pull_push(sums: &mut Sums, width: usize, height: usize, factors: &[Factors]) {
+    sums.average(|w| (w / FULL_CERTAINTY).min(1.0));
     let Some((&[fx, fy], rest)) = factors.split_first() else { return };
     let (w, h) = (width / fx, height / fy);
-    let mut coarse = vec![[0f32; 5]; w * h];
+    let mut coarse = Sums::new(w * h);
     for y in 0..h * fy {
         for x in 0..w * fx {
-            let s = sums[y * width + x];
-            if s[4] > 0.0 {
-                let c = &mut coarse[y / fy * w + x / fx];
-                for k in 0..4 {
-                    c[k] += s[k] * s[4];
-                }
-                c[4] += s[4];
+            let (from, to) = (y * width + x, y / fy * w + x / fx);
+            let weight = sums.weights[from];
+            for k in 0..4 {
+                coarse.values[to][k] += sums.values[from][k] * weight;
             }
+            coarse.weights[to] += weight;
         }
     }
     // A coarse cell is certain as soon as one of its pixels is: `FULL_CERTAINTY` is undone here.
-    coarse.iter_mut().for_each(|c| c.iter_mut().for_each(|x| *x *= FULL_CERTAINTY));
+    coarse.values.as_flattened_mut().iter_mut().for_each(|x| *x *= FULL_CERTAINTY);
+    coarse.weights.iter_mut().for_each(|x| *x *= FULL_CERTAINTY);
     pull_push(&mut coarse, w, h, rest);
     for y in 0..height {
         let (y0, ty) = between(y, fy, h);
         for x in 0..width {
-            let s = &mut sums[y * width + x];
-            if s[4] >= 1.0 {
+            let i = y * width + x;
+            let own = sums.weights[i];
+            if own >= 1.0 {
                 continue;
             }
             let (x0, tx) = between(x, fx, w);
             let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
-            let mut from_coarse = [0f32; 5];
+            let (mut from_coarse, mut total) = ([0f32; 4], 0f32);
             for (cell, weight) in [
                 (y0 * w + x0, (1.0 - tx) * (1.0 - ty)),
                 (y0 * w + x1, tx * (1.0 - ty)),
                 (y1 * w + x0, (1.0 - tx) * ty),
                 (y1 * w + x1, tx * ty),
             ] {
-                let c = coarse[cell];
-                let weight = weight * c[4];
+                let weight = weight * coarse.weights[cell];
                 for k in 0..4 {
-                    from_coarse[k] += weight * c[k];
+                    from_coarse[k] += weight * coarse.values[cell][k];
                 }
-                from_coarse[4] += weight;
+                total += weight;
             }
-            if from_coarse[4] > 0.0 {
-                let own = s[4];
-                let help = (1.0 - own) * from_coarse[4];
+            if total > 0.0 {
+                let help = (1.0 - own) * total;
                 for k in 0..4 {
-                    s[k] = (s[k] * own + from_coarse[k] / from_coarse[4] * help) / (own + help);
+                    sums.values[i][k] = (sums.values[i][k] * own + from_coarse[k] / total * help) / (own + help);
                 }
-                s[4] = own + help;
+                sums.weights[i] = own + help;
             }
         }
     }
@@ -478,38 +570,39 @@ fn between(x: usize, factor: usize, count: usize) -> (usize, f32) {
 
 /// Takes the tile out of its surroundings.
 fn collect(
-    scatter: &Scatter,
+    drawn: Wanted,
     rect: PixelRect,
     around: &Surroundings,
-    values: &[[f32; 5]],
+    sums: &Sums,
     support: Vec<Support>,
     nearest: &Nearest,
     seeds: &Seeds,
 ) -> BlendedTile {
-    let value = |i: usize| {
-        let at = (i / rect.width + around.inner.1) * around.width + i % rect.width + around.inner.0;
-        (support[i] != Support::None && values[at][4] > 0.0).then(|| values[at])
-    };
-    let colors = if scatter.colors {
-        (0..rect.len()).map(|i| value(i).map_or([f32::NAN; 3], |v| [v[0], v[1], v[2]])).collect()
-    } else {
-        Vec::new()
-    };
-    let intensities = if scatter.intensities {
-        (0..rect.len()).map(|i| value(i).map_or(f32::NAN, |v| v[3])).collect()
-    } else {
-        Vec::new()
-    };
-    let labels = if scatter.labels {
-        (0..rect.len())
-            .map(|i| match (support[i], nearest.seed[i]) {
-                (Support::None, _) | (_, u32::MAX) => 0,
-                (_, seed) => seeds.labels[seed as usize],
-            })
-            .collect()
-    } else {
-        Vec::new()
-    };
+    let mut colors = vec![[f32::NAN; 3]; if drawn.colors { rect.len() } else { 0 }];
+    let mut intensities = vec![f32::NAN; if drawn.intensities { rect.len() } else { 0 }];
+    let mut labels = vec![0; if drawn.labels { rect.len() } else { 0 }];
+    for y in 0..rect.height {
+        for x in 0..rect.width {
+            let i = y * rect.width + x;
+            if support[i] == Support::None {
+                continue;
+            }
+            let at = around.inside(x, y);
+            if sums.weights.get(at).is_some_and(|w| *w > 0.0) {
+                let [r, g, b, intensity] = sums.values[at];
+                if let Some(color) = colors.get_mut(i) {
+                    *color = [r, g, b];
+                }
+                if let Some(slot) = intensities.get_mut(i) {
+                    *slot = intensity;
+                }
+            }
+            if let Some(label) = labels.get_mut(i) {
+                let (column, row) = nearest.seed[i];
+                *label = seeds.labels[row as usize * around.width + column as usize];
+            }
+        }
+    }
     BlendedTile { support, colors, intensities, labels }
 }
 
@@ -533,12 +626,12 @@ mod tests {
         Cloud::new(ScanFrame::local(), positions, attributes, vec![source], vec![]).unwrap()
     }
 
-    fn scatter<'a>(uv: &'a [Vec2], cloud: &'a Cloud) -> Scatter<'a> {
+    const ALL: Wanted = Wanted { colors: true, intensities: true, labels: true };
+
+    fn scatter(uv: &[Vec2], cloud: &Cloud) -> Scatter {
         let index = ScatterIndex::new(uv, |_| true);
         let spacing = Spacing::measure(&index).unwrap();
-        let a = cloud.attributes();
-        let (colors, intensities, labels) = (a.colors.is_some(), a.intensities.is_some(), a.labels.is_some());
-        Scatter { index, spacing, cloud, colors, intensities, labels }
+        Scatter::new(index, spacing, cloud, ALL)
     }
 
     fn random(n: usize, side: f64) -> Vec<Vec2> {
@@ -556,7 +649,7 @@ mod tests {
         let scatter = scatter(&uv, &cloud);
         let grid = Grid::covering(Vec2::zeros(), Vec2::repeat(2.0), 0.005).unwrap();
         let reach = Reach::new(&scatter.spacing, None, grid.cell_m());
-        let tile = blend(&scatter, &grid, &reach, grid.rect(), |_| true);
+        let tile = blend(&scatter, ALL, &grid, &reach, grid.rect(), |_| true);
         let mut worst = 0.0f64;
         for (i, &value) in tile.intensities.iter().enumerate() {
             let p = grid.chart_from_pixel(Vec2::new((i % 400) as f64 + 0.5, (i / 400) as f64 + 0.5));
@@ -579,9 +672,9 @@ mod tests {
         let scatter = scatter(&uv, &cloud);
         let grid = Grid::covering(Vec2::zeros(), Vec2::repeat(2.0), 0.01).unwrap();
         let reach = Reach::new(&scatter.spacing, Some(0.3), grid.cell_m());
-        let whole = blend(&scatter, &grid, &reach, grid.rect(), |_| true);
+        let whole = blend(&scatter, ALL, &grid, &reach, grid.rect(), |_| true);
         let rect = PixelRect { column: 70, row: 64, width: 61, height: 50 };
-        let part = blend(&scatter, &grid, &reach, rect, |_| true);
+        let part = blend(&scatter, ALL, &grid, &reach, rect, |_| true);
         for i in 0..rect.len() {
             let w = (rect.row + i / rect.width) * 200 + rect.column + i % rect.width;
             assert_eq!(part.support[i], whole.support[w]);
@@ -604,7 +697,7 @@ mod tests {
         let scatter = scatter(&uv, &cloud);
         let grid = Grid::covering(Vec2::zeros(), Vec2::new(2.0, 1.0), 0.01).unwrap();
         let reach = Reach::new(&scatter.spacing, Some(0.2), grid.cell_m());
-        let tile = blend(&scatter, &grid, &reach, grid.rect(), |_| true);
+        let tile = blend(&scatter, ALL, &grid, &reach, grid.rect(), |_| true);
         for (p, &label) in uv.iter().zip(&labels) {
             let (c, r) = grid.index_of(*p).unwrap();
             assert_eq!(tile.labels[r * 200 + c], label);
@@ -634,7 +727,7 @@ mod tests {
         let scatter = scatter(&uv, &cloud);
         let grid = Grid::covering(Vec2::zeros(), Vec2::new(4.0, 2.0), 0.01).unwrap();
         let reach = Reach::new(&scatter.spacing, None, grid.cell_m());
-        let tile = blend(&scatter, &grid, &reach, grid.rect(), |_| true);
+        let tile = blend(&scatter, ALL, &grid, &reach, grid.rect(), |_| true);
         for column in [25, 75, 130, 333] {
             for (row, expected) in [(20, 60_000.0), (96, 60_000.0), (104, 1000.0), (180, 1000.0)] {
                 let c = tile.colors[row * 400 + column][1];

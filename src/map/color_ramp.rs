@@ -40,7 +40,7 @@ impl Ramp {
         let i = (position as usize).min(stops.len() - 2);
         let f = position - i as f64;
         let mix = |k: usize| f64::from(stops[i][k]) * (1.0 - f) + f64::from(stops[i + 1][k]) * f;
-        [0, 1, 2].map(|k| mix(k).round() as u8)
+        [0, 1, 2].map(|k| (mix(k) + 0.5) as u8)
     }
 }
 

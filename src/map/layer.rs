@@ -1,6 +1,7 @@
 //! The layers of a map: their names, pixel types, NoData values and how they look as a picture.
 
 use super::color_ramp::{Ramp, label_color};
+use super::samples::{SampleType, Samples};
 use crate::cloud::Label;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -64,36 +65,6 @@ impl Layer {
     }
 }
 
-/// Type of a sample.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum SampleType {
-    /// Unsigned 8 bit.
-    U8,
-    /// Unsigned 16 bit.
-    U16,
-    /// Unsigned 32 bit.
-    U32,
-    /// 32-bit float.
-    F32,
-    /// 64-bit float.
-    F64,
-}
-
-/// Samples of a piece of a layer, row by row, bands of a pixel together.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Samples {
-    /// Unsigned 8 bit.
-    U8(Vec<u8>),
-    /// Unsigned 16 bit.
-    U16(Vec<u16>),
-    /// Unsigned 32 bit.
-    U32(Vec<u32>),
-    /// 32-bit float.
-    F32(Vec<f32>),
-    /// 64-bit float.
-    F64(Vec<f64>),
-}
-
 /// A value that stands for "nothing here".
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -104,6 +75,26 @@ pub enum NoData {
     Nan,
     /// The last band is alpha: 0 where there is nothing.
     Alpha,
+}
+
+impl NoData {
+    /// The value of a sample where there is nothing.
+    pub fn value(self) -> f64 {
+        match self {
+            NoData::Value(x) => x,
+            NoData::Nan => f64::NAN,
+            NoData::Alpha => 0.0,
+        }
+    }
+
+    /// Whether the value of a sample (not of an alpha band) means that there is something.
+    pub fn is_data(self, value: f64) -> bool {
+        match self {
+            NoData::Value(none) => value != none,
+            NoData::Nan => !value.is_nan(),
+            NoData::Alpha => true,
+        }
+    }
 }
 
 /// How coarser versions of a layer are made.
@@ -200,46 +191,6 @@ pub const OBSERVED_COLOR: [u8; 3] = [116, 173, 145];
 /// Colour of filled surface in the coverage picture.
 pub const FILLED_COLOR: [u8; 3] = [244, 176, 66];
 
-impl Samples {
-    /// An empty column of the given type.
-    pub fn new(sample: SampleType) -> Self {
-        match sample {
-            SampleType::U8 => Samples::U8(Vec::new()),
-            SampleType::U16 => Samples::U16(Vec::new()),
-            SampleType::U32 => Samples::U32(Vec::new()),
-            SampleType::F32 => Samples::F32(Vec::new()),
-            SampleType::F64 => Samples::F64(Vec::new()),
-        }
-    }
-
-    /// Sample `i` as a number.
-    pub fn get(&self, i: usize) -> f64 {
-        match self {
-            Samples::U8(v) => f64::from(v[i]),
-            Samples::U16(v) => f64::from(v[i]),
-            Samples::U32(v) => f64::from(v[i]),
-            Samples::F32(v) => f64::from(v[i]),
-            Samples::F64(v) => v[i],
-        }
-    }
-
-    /// Number of samples.
-    pub fn len(&self) -> usize {
-        match self {
-            Samples::U8(v) => v.len(),
-            Samples::U16(v) => v.len(),
-            Samples::U32(v) => v.len(),
-            Samples::F32(v) => v.len(),
-            Samples::F64(v) => v.len(),
-        }
-    }
-
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-}
-
 impl LayerDescription {
     /// The picture of some samples of this layer: red, green, blue, alpha of each pixel. Empty for [`Look::None`].
     pub fn picture(&self, samples: &Samples) -> Vec<[u8; 4]> {
@@ -253,11 +204,7 @@ impl Look {
         let pixels = samples.len() / bands;
         let opaque = |[r, g, b]: [u8; 3]| [r, g, b, 255];
         let transparent = [0; 4];
-        let is_data = |x: f64| match no_data {
-            NoData::Value(none) => x != none,
-            NoData::Nan => !x.is_nan(),
-            NoData::Alpha => true,
-        };
+        let is_data = |x: f64| no_data.is_data(x);
         match self {
             Look::None => Vec::new(),
             Look::Rgba => match samples {
@@ -271,7 +218,7 @@ impl Look {
                         return transparent;
                     }
                     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
-                    opaque([(t * 255.0).round() as u8; 3])
+                    opaque([(t * 255.0 + 0.5) as u8; 3])
                 })
                 .collect(),
             Look::Ramp { ramp, low, high } => (0..pixels)

@@ -8,6 +8,7 @@
 mod blend;
 mod color_ramp;
 mod distortion_plot;
+mod describe;
 mod design_profile;
 mod draw;
 mod grid;
@@ -19,6 +20,7 @@ mod rasterize;
 mod reference_lines;
 mod relief;
 mod roughness;
+mod samples;
 mod sampling;
 pub mod sheet;
 pub(crate) mod stroke_font;
@@ -30,16 +32,17 @@ pub use blend::Support;
 pub use color_ramp::{Ramp, label_color};
 pub use design_profile::{DesignProfile, ProfileError};
 pub use distortion_plot::distortion_histogram;
-pub use draw::{DrawInput, Piece, PointsOnMap, Sink, SinkError, automatic_max_offset_m, draw};
+pub use draw::{DrawInput, MapPoints, Piece, PointsOnMap, Sink, SinkError, automatic_max_offset_m, draw, draw_points};
 pub use grid::{Grid, PixelRect, Placement, TILE_PX, automatic_cell_m};
 pub use layer::{
     COVERAGE_FILLED, COVERAGE_NONE, COVERAGE_OBSERVED, FILLED_COLOR, Layer, LayerDescription, Look, NoData,
-    OBSERVED_COLOR, PaletteEntry, Resampling, SampleType, Samples, UNLABELLED_COLOR, color_distance, palette,
+    OBSERVED_COLOR, PaletteEntry, Resampling, UNLABELLED_COLOR, color_distance, palette,
 };
 pub use legend::{Legend, LegendLayer, Swatch};
 pub use overview::{Picture, chainage_label, overview};
 pub use rasterize::{FaceIndex, NO_FACE, SurfaceTile};
 pub use reference_lines::{Feet, LineKind, ReferenceLine, reference_lines};
+pub use samples::{Block, Sample, SampleType, Samples};
 
 use crate::warning::Warning;
 use schemars::JsonSchema;

@@ -3,7 +3,7 @@
 //! Long tunnels are wrapped into rows of equal length, so that the picture keeps a shape that a screen can show. The base is the colour
 //! of the scan; without colour its intensity under a light from the upper left, without intensity the shaded relief.
 
-use super::draw::{DrawInput, Piece, Sink, SinkError, draw};
+use super::draw::{DrawInput, MapPoints, Piece, Sink, SinkError, draw_points};
 use super::grid::next_in_series;
 use super::layer::{Layer, LayerDescription};
 use super::reference_lines::{LineKind, ReferenceLine};
@@ -40,12 +40,13 @@ pub struct Picture {
     pub rgba: Vec<u8>,
 }
 
-/// Draws the overview of a map that was drawn with `settings` and gave `summary`, with its reference lines.
+/// Draws the overview of a map that was drawn of `points` with `settings` and gave `summary`, with its reference lines.
 ///
 /// # Errors
-/// As [`draw`].
+/// As [`draw_points`].
 pub fn overview(
     input: &DrawInput,
+    points: &MapPoints,
     settings: &Settings,
     summary: &Summary,
     lines: &[ReferenceLine],
@@ -62,10 +63,9 @@ pub fn overview(
     } else {
         layers.extend([Layer::Intensity, Layer::Relief].into_iter().filter(|&l| has(l)));
     }
-    let base_settings =
-        Settings { cell_m: Some(plan.cell_m), max_offset_m: Some(summary.max_offset_m), layers, ..settings.clone() };
+    let base_settings = Settings { cell_m: Some(plan.cell_m), layers, ..settings.clone() };
     let mut base = BasePicture::default();
-    draw(input, &base_settings, &mut base)?;
+    draw_points(input, points, &base_settings, &mut base)?;
     base.mark_holes();
     Ok(plan.compose(&base, lines))
 }

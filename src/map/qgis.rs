@@ -24,7 +24,7 @@ pub struct ProjectLayer {
 pub fn style(layer: &LegendLayer) -> String {
     format!(
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n\
-         <qgis version=\"3.34.0\" styleCategories=\"Symbology\">\n{}</qgis>\n",
+         <qgis version=\"3.22.0\" styleCategories=\"Symbology\">\n{}</qgis>\n",
         pipe(layer)
     )
 }
@@ -67,7 +67,7 @@ pub fn project(title: &str, legend: &Legend, vectors: &[ProjectLayer]) -> String
     let (u1, v0) = (u0 + legend.width_px as f64 * legend.cell_m, v1 - legend.height_px as f64 * legend.cell_m);
     format!(
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n\
-         <qgis projectname=\"{0}\" version=\"3.34.0\">\n  <title>{0}</title>\n  \
+         <qgis projectname=\"{0}\" version=\"3.22.0\">\n  <title>{0}</title>\n  \
          <layer-tree-group>\n{tree}  </layer-tree-group>\n  \
          <mapcanvas name=\"theMapCanvas\">\n    <units>meters</units>\n    <extent>\n      <xmin>{u0}</xmin>\n      \
          <ymin>{v0}</ymin>\n      <xmax>{u1}</xmax>\n      <ymax>{v1}</ymax>\n    </extent>\n  </mapcanvas>\n  \

@@ -7,6 +7,7 @@
 
 use crate::numeric::{Vec2, statistics};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Tangent of the half opening of the cones (20 degrees): wide enough to meet a neighbour soon, narrow enough not to
 /// take points of the same, slightly crooked, profile for neighbours along the tunnel.
@@ -24,21 +25,31 @@ const BLOCK_POINTS: f64 = 96.0;
 /// Samples over the whole chart.
 const SAMPLES: usize = 150_000;
 
-/// Points on the chart, sorted into square buckets.
+/// Points on the chart, sorted into square buckets. Their places are kept in that order, too: the map visits every
+/// point several times, and a scan gives its points in any order.
 #[derive(Debug)]
-pub struct ScatterIndex<'a> {
-    uv: &'a [Vec2],
+pub struct ScatterIndex {
     origin: Vec2,
     side: f64,
     across: usize,
     down: usize,
     starts: Vec<usize>,
     points: Vec<u32>,
+    places: Vec<Vec2>,
 }
 
-impl<'a> ScatterIndex<'a> {
+/// One bucket of a [`ScatterIndex`].
+#[derive(Clone, Debug)]
+pub struct Bucket {
+    /// Its middle on the chart.
+    pub centre: Vec2,
+    /// Its points: positions in [`ScatterIndex::points`] and [`ScatterIndex::places`].
+    pub members: Range<usize>,
+}
+
+impl ScatterIndex {
     /// Sorts the points that `keep` accepts; points without finite coordinates are left out.
-    pub fn new(uv: &'a [Vec2], keep: impl Fn(usize) -> bool) -> Self {
+    pub fn new(uv: &[Vec2], keep: impl Fn(usize) -> bool) -> Self {
         let kept = |i: usize| uv[i].x.is_finite() && uv[i].y.is_finite() && keep(i);
         let (mut low, mut high, mut count) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY), 0usize);
         for i in (0..uv.len()).filter(|&i| kept(i)) {
@@ -48,13 +59,13 @@ impl<'a> ScatterIndex<'a> {
         }
         if count == 0 {
             return Self {
-                uv,
                 origin: Vec2::zeros(),
                 side: 1.0,
                 across: 1,
                 down: 1,
                 starts: vec![0; 2],
                 points: vec![],
+                places: vec![],
             };
         }
         let extent = high - low;
@@ -62,8 +73,8 @@ impl<'a> ScatterIndex<'a> {
         let side = (BUCKET_POINTS * area / count as f64).sqrt().max(1e-4);
         let across = (extent.x / side) as usize + 1;
         let down = (extent.y / side) as usize + 1;
-        let mut index =
-            Self { uv, origin: low, side, across, down, starts: vec![0; across * down + 1], points: vec![] };
+        let starts = vec![0; across * down + 1];
+        let mut index = Self { origin: low, side, across, down, starts, points: vec![], places: vec![] };
         for i in (0..uv.len()).filter(|&i| kept(i)) {
             let bucket = index.bucket_of(uv[i]);
             index.starts[bucket + 1] += 1;
@@ -78,7 +89,18 @@ impl<'a> ScatterIndex<'a> {
             index.points[next[bucket]] = i as u32;
             next[bucket] += 1;
         }
+        index.places = index.points.iter().map(|&i| uv[i as usize]).collect();
         index
+    }
+
+    /// The points in the order of the buckets: their numbers in the scan.
+    pub fn points(&self) -> &[u32] {
+        &self.points
+    }
+
+    /// The places of [`Self::points`] on the chart.
+    pub fn places(&self) -> &[Vec2] {
+        &self.places
     }
 
     /// Points in the index.
@@ -91,16 +113,20 @@ impl<'a> ScatterIndex<'a> {
         self.points.is_empty()
     }
 
-    /// Calls `visit` for each point in the chart rectangle (and a few around it), in a fixed order.
-    pub fn for_each_near(&self, low: Vec2, high: Vec2, mut visit: impl FnMut(u32, Vec2)) {
-        let Some((c0, c1)) = self.range(low.x - self.origin.x, high.x - self.origin.x, self.across) else { return };
-        let Some((r0, r1)) = self.range(low.y - self.origin.y, high.y - self.origin.y, self.down) else { return };
-        for r in r0..=r1 {
-            let line = r * self.across;
-            for &i in &self.points[self.starts[line + c0]..self.starts[line + c1 + 1]] {
-                visit(i, self.uv[i as usize]);
-            }
-        }
+    /// The buckets that touch a chart rectangle, row by row.
+    pub fn buckets_near(&self, low: Vec2, high: Vec2) -> impl Iterator<Item = Bucket> + '_ {
+        let columns = self.range(low.x - self.origin.x, high.x - self.origin.x, self.across);
+        let rows = self.range(low.y - self.origin.y, high.y - self.origin.y, self.down);
+        let found = columns.zip(rows).into_iter();
+        found.flat_map(move |((c0, c1), (r0, r1))| {
+            (r0..=r1).flat_map(move |r| {
+                (c0..=c1).map(move |c| {
+                    let bucket = r * self.across + c;
+                    let centre = self.origin + Vec2::new(c as f64 + 0.5, r as f64 + 0.5) * self.side;
+                    Bucket { centre, members: self.starts[bucket]..self.starts[bucket + 1] }
+                })
+            })
+        })
     }
 
     fn range(&self, low: f64, high: f64, count: usize) -> Option<(usize, usize)> {
@@ -116,8 +142,8 @@ impl<'a> ScatterIndex<'a> {
     }
 
     /// Distance along u and along v to the nearest neighbour in the double cone around each direction.
-    fn cone_distances(&self, point: u32) -> [Option<f64>; 2] {
-        let p = self.uv[point as usize];
+    fn cone_distances(&self, member: usize) -> [Option<f64>; 2] {
+        let p = self.places[member];
         let mut best = [SEARCH_RADIUS_M; 2];
         let (column, row) = {
             let bucket = self.bucket_of(p);
@@ -137,12 +163,12 @@ impl<'a> ScatterIndex<'a> {
                 while c <= column + ring {
                     if c >= 0 && c < self.across as i64 {
                         let bucket = r as usize * self.across + c as usize;
-                        for &i in &self.points[self.starts[bucket]..self.starts[bucket + 1]] {
-                            let d = (self.uv[i as usize] - p).abs();
-                            if i != point && d.y <= CONE_TANGENT * d.x && d.x > 0.0 {
+                        for i in self.starts[bucket]..self.starts[bucket + 1] {
+                            let d = (self.places[i] - p).abs();
+                            if i != member && d.y <= CONE_TANGENT * d.x && d.x > 0.0 {
                                 best[0] = best[0].min(d.x);
                             }
-                            if i != point && d.x <= CONE_TANGENT * d.y && d.y > 0.0 {
+                            if i != member && d.x <= CONE_TANGENT * d.y && d.y > 0.0 {
                                 best[1] = best[1].min(d.y);
                             }
                         }
@@ -185,16 +211,16 @@ impl Spacing {
             .map(|block| {
                 let (c0, r0) = (block % across * buckets, block / across * buckets);
                 let (c1, r1) = ((c0 + buckets).min(index.across), (r0 + buckets).min(index.down));
-                let members: Vec<u32> = (r0..r1)
+                let members: Vec<usize> = (r0..r1)
                     .flat_map(|r| {
                         let line = r * index.across;
-                        index.points[index.starts[line + c0]..index.starts[line + c1]].iter().copied()
+                        index.starts[line + c0]..index.starts[line + c1]
                     })
                     .collect();
                 let step = members.len().div_ceil(wanted).max(1);
                 let mut found = [Vec::new(), Vec::new()];
-                for &point in members.iter().step_by(step) {
-                    for (direction, distance) in index.cone_distances(point).into_iter().enumerate() {
+                for &member in members.iter().step_by(step) {
+                    for (direction, distance) in index.cone_distances(member).into_iter().enumerate() {
                         found[direction].extend(distance);
                     }
                 }
@@ -297,11 +323,11 @@ mod tests {
         let (low, high) = (Vec2::new(1.0, 0.5), Vec2::new(1.7, 2.0));
         let inside = |p: Vec2| p.x >= low.x && p.y >= low.y && p.x <= high.x && p.y <= high.y;
         let mut found = Vec::new();
-        index.for_each_near(low, high, |i, p| {
-            if inside(p) {
-                found.push(i)
+        for i in index.buckets_near(low, high).flat_map(|bucket| bucket.members) {
+            if inside(index.places()[i]) {
+                found.push(index.points()[i]);
             }
-        });
+        }
         found.sort_unstable();
         let expected: Vec<u32> = (0..3000u32).filter(|&i| i % 2 == 0 && inside(uv[i as usize])).collect();
         assert_eq!(found, expected);

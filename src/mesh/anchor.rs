@@ -202,7 +202,13 @@ impl<'a> Anchoring<'a> {
         if !p.iter().all(|c| c.is_finite()) {
             return None;
         }
-        let nearest = self.tree.nearest(self.mesh, p, reach, guess)?;
+        // From the guess to the face below the point: the nearer the first face, the sooner the search ends. Mostly it is
+        // the nearest, from which the walk below would come to the same anchor.
+        let hint = guess.and_then(|face| self.walk(face, p, reach));
+        let nearest = self.tree.nearest(self.mesh, p, reach, hint.map(|h| h.face).or(guess))?;
+        if let Some(anchor) = hint.filter(|h| h.face == nearest.face) {
+            return Some((anchor, true));
+        }
         let limit = reach.max(2.0 * nearest.squared_distance.sqrt());
         if let Some(anchor) = self.walk(nearest.face, p, limit).or_else(|| self.look_around(nearest.face, p, limit)) {
             return Some((anchor, true));

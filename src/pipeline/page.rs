@@ -3,6 +3,7 @@
 use super::limits::number;
 use super::picture::{base64, thumbnail, upright_piece};
 use super::plots::{self, Plot};
+use rayon::prelude::*;
 use serde_json::Value;
 use std::fmt::Write;
 use std::path::Path;
@@ -54,19 +55,20 @@ pub(super) fn page(report: &Value, folder: &Path, axis_csv: &str) -> String {
         let _ = write!(html, "<br>{}", escape(text_of(check, "message")));
     }
     html.push_str("</div>\n");
-    figure(
-        &mut html,
-        folder,
-        "map/map.png",
-        "Overview: chainage to the right, crown in the centre, seen from inside facing increasing chainage.",
-    );
+    // Reading a large picture takes a second: all of them at once.
+    let thumbnails: Vec<Option<Vec<u8>>> =
+        FIGURES.par_iter().map(|(name, _)| thumbnail(&folder.join(name), 1600)).collect();
+    let figures: Vec<String> =
+        FIGURES.iter().zip(&thumbnails).map(|((_, caption), png)| figure(png.as_deref(), caption)).collect();
+    let [overview, coverage, distortion, offset] = [0, 1, 2, 3].map(|k| figures[k].as_str());
+    html.push_str(overview);
     limits(&mut html, report, folder);
     facts(&mut html, report);
     html.push_str("<h2>Where the map is good</h2>\n");
-    figure(&mut html, folder, "map/coverage.png", "Coverage: green is observed, orange filled, empty no surface.");
-    figure(&mut html, folder, "map/distortion.png", "Distortion: the darker or warmer, the more the map stretches.");
+    html.push_str(coverage);
+    html.push_str(distortion);
     drawing(&mut html, folder, "map/distortion_histogram.svg", "Length factors of the map, by share of the surface.");
-    figure(&mut html, folder, "map/offset.png", "Distance from the local mean section: rock towards the void is red.");
+    html.push_str(offset);
     along(&mut html, report);
     histograms(&mut html, report);
     sections(&mut html, report);
@@ -95,19 +97,29 @@ fn is_effort(check: &Value) -> bool {
     EFFORT.contains(&text_of(check, "name"))
 }
 
-fn figure(html: &mut String, folder: &Path, name: &str, caption: &str) {
-    if let Some(png) = thumbnail(&folder.join(name), 1600) {
-        let side = |at: usize| png.get(at..at + 4).map_or(1, |b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
-        // A long tunnel is scrolled sideways instead of being squeezed into a line.
-        let class = if side(16) > 4 * side(20) { " class=\"long\"" } else { "" };
-        let alternative = escape(caption);
-        let _ = writeln!(
-            html,
-            "<figure><div class=\"scroll\"><img{class} alt=\"{alternative}\" src=\"data:image/png;base64,{}\"></div>\
-             <figcaption>{alternative}</figcaption></figure>",
-            base64(&png)
-        );
-    }
+/// The pictures of the page and what is written below them.
+const FIGURES: [(&str, &str); 4] = [
+    (
+        "map/map.png",
+        "Overview: chainage to the right, crown in the centre, seen from inside facing increasing chainage.",
+    ),
+    ("map/coverage.png", "Coverage: green is observed, orange filled, empty no surface."),
+    ("map/distortion.png", "Distortion: the darker or warmer, the more the map stretches."),
+    ("map/offset.png", "Distance from the local mean section: rock towards the void is red."),
+];
+
+/// A picture with its caption; nothing without a picture.
+fn figure(png: Option<&[u8]>, caption: &str) -> String {
+    let Some(png) = png else { return String::new() };
+    let side = |at: usize| png.get(at..at + 4).map_or(1, |b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
+    // A long tunnel is scrolled sideways instead of being squeezed into a line.
+    let class = if side(16) > 4 * side(20) { " class=\"long\"" } else { "" };
+    let alternative = escape(caption);
+    format!(
+        "<figure><div class=\"scroll\"><img{class} alt=\"{alternative}\" src=\"data:image/png;base64,{}\"></div>\
+         <figcaption>{alternative}</figcaption></figure>\n",
+        base64(png)
+    )
 }
 
 /// A drawing that is text: part of the page as it is, but for the name of its language, which is an address.

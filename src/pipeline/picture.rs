@@ -56,12 +56,13 @@ fn thin(rows: &mut Rows, from: usize, to: usize, step: usize) -> Option<Vec<u8>>
     let mut counts = vec![0u64; columns];
     for y in 0..height {
         let row = rows.next()?;
-        for (x, pixel) in row.chunks_exact(channels).take(to).skip(from).enumerate() {
-            if opaque(pixel) {
-                for (sum, &value) in sums[x / step].iter_mut().zip(pixel) {
+        let row = row.get(from * channels..to * channels)?;
+        for ((block, sums), count) in row.chunks(step * channels).zip(&mut sums).zip(&mut counts) {
+            for pixel in block.chunks_exact(channels).filter(|p| opaque(p)) {
+                for (sum, &value) in sums.iter_mut().zip(pixel) {
                     *sum += u64::from(value);
                 }
-                counts[x / step] += 1;
+                *count += 1;
             }
         }
         if y % step == step - 1 || y == height - 1 {

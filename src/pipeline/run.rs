@@ -45,7 +45,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
-    Stage { name: "map", version: 3, needs: &["anchor", "unwrap", "mesh", "ingest"] },
+    Stage { name: "map", version: 4, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
 ];
@@ -57,7 +57,7 @@ pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "mesh", version: 5, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
-    Stage { name: "map", version: 2, needs: &["unwrap", "mesh", "ingest"] },
+    Stage { name: "map", version: 3, needs: &["unwrap", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "unwrap", "mesh", "axis"] },
 ];
 
@@ -612,19 +612,31 @@ fn draw_map(
     let folder = staging.join("map");
     std::fs::create_dir(&folder).map_err(cannot_write("map", &folder))?;
     let mut sink = io::MapFolder::new(&folder).with_tiles(pipeline.map.tiles);
-    let summary = map::draw(input, &pipeline.map, &mut sink).map_err(Error::in_stage("map"))?;
+    let points = map::MapPoints::of(input, &pipeline.map).map_err(Error::in_stage("map"))?;
+    let summary = map::draw_points(input, &points, &pipeline.map, &mut sink).map_err(Error::in_stage("map"))?;
     let text = serde_json::to_string(lines).expect("lines are plain data");
     write_text("map", &folder.join("lines.json"), &format!("{text}\n"))?;
-    let picture = map::overview(input, &pipeline.map, &summary, lines).map_err(Error::in_stage("map"))?;
-    io::write_picture(&folder.join("map.png"), &picture, None)
-        .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))?;
-    let faces = unwrap::distortion::of_faces(input.chart.strip().mesh(), input.chart.uv());
+    let mesh = input.chart.strip().mesh();
+    // Neither keeps two threads busy all the time.
+    let (picture, certificate) = rayon::join(
+        || -> Result<(), Error> {
+            let picture =
+                map::overview(input, &points, &pipeline.map, &summary, lines).map_err(Error::in_stage("map"))?;
+            io::write_picture(&folder.join("map.png"), &picture, None)
+                .map_err(|error| Error::in_stage("map")(map::Error::Sink(Box::new(error))))
+        },
+        || {
+            let (index, anchoring) =
+                rayon::join(|| unwrap::ChartIndex::of(input.chart), || anchor::Anchoring::of(mesh));
+            let settings = FlattenSettings { anchor: pipeline.anchor.clone(), ..FlattenSettings::default() };
+            linework::certify(&index, &anchoring, summary.cell_m, &settings)
+        },
+    );
+    picture?;
+    let faces = unwrap::distortion::of_faces(mesh, input.chart.uv());
     write_text("map", &folder.join("distortion_histogram.svg"), &map::distortion_histogram(&faces))?;
-    let index = unwrap::ChartIndex::of(input.chart);
-    let anchoring = anchor::Anchoring::of(input.chart.strip().mesh());
-    let settings = FlattenSettings { anchor: pipeline.anchor.clone(), ..FlattenSettings::default() };
     let mut told = section(&summary);
-    told["roundtrip"] = json!(linework::certify(&index, &anchoring, summary.cell_m, &settings));
+    told["roundtrip"] = json!(certificate);
     Ok(((), told))
 }
 

@@ -8,6 +8,7 @@
 
 use super::error::Kind;
 use super::folder_lock::FolderLock;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -230,14 +231,14 @@ impl RunFolder {
         let mut names = Vec::new();
         collect_files(staging, "", &mut names)?;
         names.sort();
-        let mut files = Vec::new();
-        for name in &names {
+        let store = |name: &String| {
             let staged = staging.join(name);
             let file = File::open(&staged).map_err(Error::io("open", &staged))?;
             file.sync_all().map_err(Error::io("sync", &staged))?;
             let bytes = file.metadata().map_err(Error::io("inspect", &staged))?.len();
-            files.push(ProductFile { name: name.clone(), bytes, sha256: sha256_of(&staged)? });
-        }
+            Ok(ProductFile { name: name.clone(), bytes, sha256: sha256_of(&staged)? })
+        };
+        let files = names.par_iter().map(store).collect::<Result<Vec<_>, Error>>()?;
         for name in &names {
             let place = self.path.join(name);
             if let Some(folder) = place.parent() {
