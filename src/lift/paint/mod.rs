@@ -276,6 +276,7 @@ fn refine(parts: &[Part], first: usize, shown: &mut Vec<[u8; 3]>, rules: &Rules)
             shown[k] = better;
             moved.push(k);
         } else if k < first
+            && rules.is_known
             && distance_from(&shown[k]) > NEW_COLOR
             && shown.iter().enumerate().all(|(j, c)| j == k || distance_from(c) > 2.0 * NEW_COLOR)
             && parts.iter().filter_map(|p| p.used.get(k)).sum::<usize>() >= few
@@ -300,6 +301,8 @@ struct Rules {
     near_on_map: f64,
     /// Whether small differences are to be expected anywhere.
     mixed: bool,
+    /// Whether it is known what happened to the picture, so that what is left tells of colours.
+    is_known: bool,
     /// Whether brightness and colour were spread differently (JPEG).
     lossy: bool,
     /// How far beyond both colours of a mixture a colour may be, as a share of their difference.
@@ -328,6 +331,7 @@ impl Rules {
             near_on_map: NEAR_PX as f64 * place.scale().max(1.0),
             mixed: noisy || resized,
             lossy,
+            is_known: passage.is_known,
             swing: if resized && passage.filter.kernel.sharpens() { SWING } else { 0.0 },
             unexplained: if noisy {
                 0.6 * tolerance + 8.0

@@ -189,8 +189,9 @@ mod tests {
         let (grey, dark, red) = ([120; 3], [100; 3], [200, 30, 40]);
         let pairs = [
             (grey, grey),
-            (grey, red),
             (grey, grey),
+            (grey, red),
+            ([104; 3], dark),
             ([104; 3], dark),
             ([104; 3], dark),
             ([104; 3], dark),

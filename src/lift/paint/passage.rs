@@ -16,9 +16,11 @@ const MAX_MEDIAN: f64 = 30.0;
 const PIECES: f64 = 80.0;
 const PIECE_PX: usize = 64;
 /// Kernels are told apart where they differ by more than this.
-const TELLING: f64 = 4.0;
+const TELLING: f64 = 2.0;
 /// Painted pixels tell nothing about the kernel; a difference counts up to this.
 const MOST: f64 = 20.0;
+/// A kernel that leaves more than this on average, where kernels differ, is not the one.
+const KNOWN: f64 = 5.0;
 /// A picture is exact when so many of its pixels are.
 const EXACT_SHARE: f64 = 0.9;
 /// Dithering is smoothed by a triangle of this half width.
@@ -42,6 +44,8 @@ pub(super) struct Passage {
     background: Option<[u8; 3]>,
     palette: Option<Palette>,
     pub(super) lossy: bool,
+    /// Whether one of the kernels predicts the picture.
+    pub(super) is_known: bool,
 }
 
 impl Passage {
@@ -94,6 +98,7 @@ pub(super) fn identify<'a>(
         background: background(edited, &bases[0].picture, place),
         palette: None,
         lossy,
+        is_known: true,
     };
     let differences = |base: &Base, passage: &Passage| -> Vec<f64> {
         let of_piece = |&piece: &PixelRect| {
@@ -113,28 +118,19 @@ pub(super) fn identify<'a>(
     let Some((_, base)) = best else {
         return Err(Error::NoBase { closest: "none".into(), percent: 0.0 });
     };
+    let mut rest = 0.0;
     if place.is_resized() {
-        passage.filter = Filter::of(find_kernel(edited, base, place, &passage, &pieces));
+        (passage, rest) = find_kernel(edited, base, place, &passage, &pieces);
     } else if !lossy {
         let before = differences(base, &passage);
         find_palette(edited, base, place, &mut passage, &before);
     }
     let mut found = differences(base, &passage);
-    let mut plain = Passage { alpha: Alpha::Plain, ..passage.clone() };
-    if place.is_resized() && passage.background.is_none() {
-        let of_edges = |passage: &Passage| -> f64 {
-            let of_piece = |&piece: &PixelRect| -> f64 {
-                let window = Window::new(piece, place, passage, edited, &base.picture);
-                let is_edge = |i: &usize| window.seen[*i][3] > 1.0 && window.seen[*i][3] < 254.0;
-                (0..window.seen.len()).filter(is_edge).map(|i| window.difference(i).min(MOST)).sum()
-            };
-            pieces.par_iter().map(of_piece).collect::<Vec<f64>>().iter().sum()
-        };
-        if of_edges(&plain) < of_edges(&passage) {
-            std::mem::swap(&mut plain, &mut passage);
-        }
+    let mut median = statistics::median(&mut found).unwrap_or(f64::INFINITY);
+    if !lossy && rest > KNOWN {
+        passage.is_known = false;
+        median = median.max(rest / 2.0);
     }
-    let median = statistics::median(&mut found).unwrap_or(f64::INFINITY);
     let tolerance = (SAME + NOISE_FACTOR * median.min(MAX_MEDIAN)).min(MAX_TOLERANCE);
     let share = found.iter().filter(|d| **d <= tolerance).count() as f64 / found.len().max(1) as f64;
     if share >= BASE_SHARE && median <= MAX_MEDIAN {
@@ -185,31 +181,45 @@ fn background(edited: &Picture, labels: &Picture, place: &Place) -> Option<[u8; 
     (alpha >= OPAQUE).then_some([r, g, b])
 }
 
-/// The kernel that the picture was resized with: the one that predicts it best where kernels differ.
-fn find_kernel(edited: &Picture, base: &Base, place: &Place, passage: &Passage, pieces: &[PixelRect]) -> Kernel {
-    let of_piece = |&piece: &PixelRect| -> [f64; Kernel::ALL.len()] {
-        let windows = Kernel::ALL.map(|kernel| {
-            let passage = Passage { filter: Filter::of(kernel), ..passage.clone() };
-            Window::new(piece, place, &passage, edited, &base.picture)
-        });
-        let mut sums = [0.0; Kernel::ALL.len()];
+/// The kernel that the picture was resized with, and how transparent pixels were mixed: what predicts it best where kernels
+/// differ. Gives the mean difference that is left there, too.
+fn find_kernel(
+    edited: &Picture,
+    base: &Base,
+    place: &Place,
+    passage: &Passage,
+    pieces: &[PixelRect],
+) -> (Passage, f64) {
+    let kinds: &[Alpha] =
+        if passage.background.is_some() { &[Alpha::Weighted] } else { &[Alpha::Weighted, Alpha::Plain] };
+    let candidates: Vec<Passage> = Kernel::ALL
+        .iter()
+        .flat_map(|&kernel| kinds.iter().map(move |&alpha| (Filter::of(kernel), alpha)))
+        .map(|(filter, alpha)| Passage { filter, alpha, ..passage.clone() })
+        .collect();
+    let of_piece = |&piece: &PixelRect| -> (Vec<f64>, usize) {
+        let windows: Vec<Window> =
+            candidates.iter().map(|passage| Window::new(piece, place, passage, edited, &base.picture)).collect();
+        let (mut sums, mut count) = (vec![0.0; candidates.len()], 0);
         // The widest kernel has the fewest complete pixels.
-        let inner = windows.iter().map(|w| w.edited).reduce(common).unwrap_or(windows[0].edited);
+        let inner = windows.iter().map(|w| w.edited).reduce(common).unwrap_or(piece);
         for y in inner.row..inner.row + inner.height {
             for x in inner.column..inner.column + inner.width {
                 let at = |w: &Window| (y - w.edited.row) * w.edited.width + x - w.edited.column;
                 let first = windows[0].expected[at(&windows[0])];
                 if windows.iter().any(|w| far(w.expected[at(w)], first) > TELLING) {
                     windows.iter().zip(&mut sums).for_each(|(w, s)| *s += w.difference(at(w)).min(MOST));
+                    count += 1;
                 }
             }
         }
-        sums
+        (sums, count)
     };
-    let parts: Vec<_> = pieces.par_iter().map(of_piece).collect();
-    let total = |k: usize| parts.iter().map(|p| p[k]).sum::<f64>();
-    let best = (0..Kernel::ALL.len()).min_by(|&a, &b| total(a).total_cmp(&total(b))).unwrap_or(0);
-    Kernel::ALL[best]
+    let parts: Vec<(Vec<f64>, usize)> = pieces.par_iter().map(of_piece).collect();
+    let count: usize = parts.iter().map(|p| p.1).sum();
+    let total = |k: usize| parts.iter().map(|p| p.0[k]).sum::<f64>();
+    let best = (0..candidates.len()).min_by(|&a, &b| total(a).total_cmp(&total(b))).unwrap_or(0);
+    (candidates[best].clone(), total(best) / count.max(1) as f64)
 }
 
 fn common(a: PixelRect, b: PixelRect) -> PixelRect {

@@ -4,7 +4,7 @@ use super::mixture::{Painted, Shares, drop_isolated};
 use super::new_classes::Candidates;
 use super::passage::Passage;
 use super::resampling::{Axis, Band, Filter, Kernel, resample};
-use super::synthesis::{Allowed, Scene, State as Class, View};
+use super::synthesis::{Allowed, Scene, Search, State as Class, View};
 use super::window::{OPAQUE, Place, State, Window, far};
 use super::{NEW_COLOR, Rules, distance, rgb};
 use crate::cloud::Label;
@@ -13,6 +13,8 @@ use crate::map::{PaletteEntry, Picture, PixelRect, color_distance};
 
 /// Standard deviation of the noise of an exact picture: rounding.
 const ROUNDING: f64 = 1.0;
+/// Shares are added up this exactly.
+const HALF_SLACK: f32 = 1e-4;
 /// JPEG is at least this noisy where something was painted, in brightness and in colour.
 const LOSSY_NOISE: [f64; 2] = [6.0, 6.0];
 /// The median of distances in three channels is this many standard deviations of one.
@@ -104,7 +106,13 @@ impl Frame<'_> {
         paints.push([0.0; 4]);
         let views = self.views(&window);
         let mut scene = Scene::new(window.map.width, &window.base, &paints, &allowed, views);
-        scene.find(&first_states(&window, &shares), self.rules.mixed);
+        let is_sampled = self.passage.filter.kernel.is_exact() && self.place.scale() > 1.0;
+        let search = match (is_sampled, self.rules.mixed) {
+            (true, _) => Search::None,
+            (false, false) => Search::Plain,
+            (false, true) => Search::Full,
+        };
+        scene.find(&first_states(&window, &shares, is_sampled), search);
         let states = scene.states.clone();
         let mut doubtful = vec![false; states.len()];
         scene.doubtful().into_iter().for_each(|p| doubtful[p] = true);
@@ -275,11 +283,14 @@ fn certain(painted: &Painted) -> Vec<Option<u16>> {
     certain
 }
 
-/// The states that the painted shares suggest, interpolated: painted where they are a half or more.
-fn first_states(window: &Window, shares: &[Option<(f64, Shares)>]) -> Vec<Class> {
+/// The states that the painted shares suggest, interpolated: painted where they are a half or more. If the picture shows only
+/// some pixels of the map (`is_sampled`), pixels half way between painted and other ones are painted only where a line would
+/// be thinner than elsewhere without them.
+fn first_states(window: &Window, shares: &[Option<(f64, Shares)>], is_sampled: bool) -> Vec<Class> {
     let (width, height) = (window.map.width, window.map.height);
     let (across, down) = (Window::between(&window.columns, width), Window::between(&window.rows, height));
     let mut states = vec![0; width * height];
+    let mut is_sure = vec![false; width * height];
     let mut totals: Vec<(u16, f32)> = Vec::new();
     for (p, state) in states.iter_mut().enumerate() {
         let ((k, tx), (l, ty)) = (across[p % width], down[p / width]);
@@ -300,11 +311,40 @@ fn first_states(window: &Window, shares: &[Option<(f64, Shares)>]) -> Vec<Class>
         }
         let most = totals.iter().copied().reduce(|a, b| if b.1 > a.1 { b } else { a });
         let sum: f32 = totals.iter().map(|t| t.1).sum();
-        if let Some((class, _)) = most.filter(|_| sum >= 0.5 - 1e-4) {
+        is_sure[p] = sum > 0.5 + HALF_SLACK;
+        if let Some((class, _)) = most.filter(|_| sum >= 0.5 - HALF_SLACK) {
             *state = class + 1;
         }
     }
+    if is_sampled {
+        let is_wide = opened(&is_sure, width);
+        let around = |p: usize| {
+            let (x, y) = (p % width, p / width);
+            (y.saturating_sub(1)..(y + 2).min(height))
+                .flat_map(move |ny| (x.saturating_sub(1)..(x + 2).min(width)).map(move |nx| ny * width + nx))
+        };
+        for p in 0..states.len() {
+            if !is_sure[p] && !around(p).any(|n| is_sure[n] && !is_wide[n]) {
+                states[p] = 0;
+            }
+        }
+    }
     states
+}
+
+/// The pixels (`width` in a row) that lie in a square of 3 x 3 marked ones.
+fn opened(marked: &[bool], width: usize) -> Vec<bool> {
+    let mut out = vec![false; marked.len()];
+    let height = marked.len() / width.max(1);
+    for y in 1..height.saturating_sub(1) {
+        for x in 1..width.saturating_sub(1) {
+            let square = || (y - 1..y + 2).flat_map(|ny| (x - 1..x + 2).map(move |nx| ny * width + nx));
+            if square().all(|n| marked[n]) {
+                square().for_each(|n| out[n] = true);
+            }
+        }
+    }
+    out
 }
 
 /// Brightness (Rec. 601, as in JPEG).

@@ -106,6 +106,17 @@ impl View {
     }
 }
 
+/// How far to look for better states.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Search {
+    /// Not at all.
+    None,
+    /// Pixel by pixel.
+    Plain,
+    /// With short outlines first, and with small regions as a whole in the end.
+    Full,
+}
+
 /// Pixels of the map whose states are sought.
 pub(super) struct Scene<'a> {
     width: usize,
@@ -137,16 +148,21 @@ impl<'a> Scene<'a> {
         Scene { width, base, colors, allowed, views, states: vec![0; base.len()], outline: OUTLINE[2] }
     }
 
-    /// Finds the states, beginning with `first`. Small regions are looked at as a whole if `is_mixed`.
-    pub(super) fn find(&mut self, first: &[State], is_mixed: bool) {
+    /// Finds the states, beginning with `first`.
+    pub(super) fn find(&mut self, first: &[State], search: Search) {
         for (p, &state) in first.iter().enumerate().filter(|(_, state)| **state != 0) {
             self.set(p, state);
         }
-        for outline in if is_mixed { &OUTLINE[..] } else { &OUTLINE[2..] } {
+        let outlines = match search {
+            Search::None => &[],
+            Search::Plain => &OUTLINE[2..],
+            Search::Full => &OUTLINE[..],
+        };
+        for outline in outlines {
             self.outline = *outline;
             self.settle();
         }
-        if is_mixed {
+        if search == Search::Full {
             self.reconsider();
             self.settle();
         }

@@ -1,8 +1,8 @@
 //! A piece of the map and the pixels of the edited picture that are made of it.
 
+use super::Error;
 use super::passage::Passage;
 use super::resampling::{Axis, Band, resample};
-use super::{Error, distance};
 use crate::map::{Picture, PixelRect, Placement};
 use crate::numeric::Vec2;
 use std::collections::HashMap;
@@ -196,7 +196,7 @@ impl Window {
 
     /// How far a pixel of the edited picture is from what the base would give.
     pub(super) fn difference(&self, i: usize) -> f64 {
-        far(self.seen[i], self.expected[i])
+        far(self.seen[i], self.expected[i].map(|c| c.clamp(0.0, 255.0)))
     }
 
     /// Whether a pixel of the edited picture shows surface, and is not transparent.
@@ -237,7 +237,7 @@ impl Window {
             (0..3).all(|k| high[k] - low[k] <= EVEN)
         };
         let seen = |i: usize| {
-            let (seen, expected) = (self.seen[i], self.expected[i]);
+            let (seen, expected) = (self.seen[i], self.expected[i].map(|c| c.clamp(0.0, 255.0)));
             let state = if expected[3] >= f32::from(OPAQUE) && seen[3] < f32::from(OPAQUE) {
                 State::Erased
             } else if far(seen, expected) > tolerance {
@@ -245,7 +245,7 @@ impl Window {
             } else {
                 State::Same
             };
-            let base = [0, 1, 2].map(|k| expected[k].clamp(0.0, 255.0).round() as u8);
+            let base = [0, 1, 2].map(|k| expected[k].round() as u8);
             Seen { state, base, even: state != State::Painted || !is_mixed || even(i) }
         };
         (0..self.seen.len()).map(seen).collect()
