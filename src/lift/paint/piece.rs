@@ -158,7 +158,7 @@ impl Frame<'_> {
         for i in 0..painted.seen.len() {
             plausible.clear();
             plausible.extend(class_at(i));
-            if self.rules.noisy && painted.seen[i].state == State::Painted {
+            if self.rules.mixed && painted.seen[i].state == State::Painted {
                 plausible.extend(occurring.iter().filter(|&&k| k != erased && painted.is_plausible(i, k)));
             }
             let columns = near(&window.columns, i % window.edited.width, width);
