@@ -94,6 +94,12 @@ impl Frame<'_> {
         let painted = Painted { picture: &picture, seen: &seen, classes: colors, rules: self.rules };
         let certain = certain(&painted);
         let erased = colors.len() as u16;
+        part.used = vec![0; colors.len() + 1];
+        if certain.iter().all(Option::is_none) && seen.iter().all(|s| s.state != State::Erased) {
+            let shares = vec![None; seen.len()];
+            self.count(&window, &painted, &certain, &shares, &window.expected, &mut part);
+            return part;
+        }
         let allowed = self.allowed(&window, &painted, &certain, erased);
         let shares: Vec<Option<(f64, Shares)>> = (0..seen.len())
             .map(|i| match seen[i].state {
@@ -117,7 +123,6 @@ impl Frame<'_> {
         let mut doubtful = vec![false; states.len()];
         scene.doubtful().into_iter().for_each(|p| doubtful[p] = true);
 
-        part.used = vec![0; colors.len() + 1];
         let (x0, y0) = (core.column - window.map.column, core.row - window.map.row);
         for (i, (column, row)) in all().enumerate() {
             let p = (y0 + i / core.width) * window.map.width + x0 + i % core.width;
