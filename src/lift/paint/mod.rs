@@ -1,25 +1,26 @@
 //! What was painted on a picture of the map, whatever the paint program did to the file.
 //!
-//! The edited picture is compared with the pictures of the map; the one it agrees with most is its *base*. Where it
-//! agrees within the noise of the file, nothing was painted: the class is that of the label map before. Elsewhere the
-//! colour `p` is taken for paint `c` over the base `b`: `p = b + a (c - b)`, where `c` is a colour of the palette, or a new
-//! flat colour (which becomes a new class), and `a` is the share of the pixel that is painted. Pixels with colours in
-//! between (smoothed edges, resized pictures, JPEG) thus tell how much of them is painted; the map, in its own pixels,
-//! is painted where the interpolated share is a half or more.
+//! 1. [`passage`]: the edited picture is compared with the pictures of the map. The one it agrees with most is its *base*, and
+//!    where nothing was painted it tells what happened to the file: kernel, transparency, palette, noise.
+//! 2. [`window`]: the map is worked on piece by piece. Each has the base as it would have come back, and the pixels that differ.
+//! 3. [`mixture`]: a pixel that differs is taken for paint `c` over the base `b`, `p = b + a (c - b)`; where that leaves no doubt, its
+//!    class is certain.
+//! 4. [`synthesis`]: the pixels of the map get the classes, of those certain near them, that make the picture that came back.
+//! 5. [`new_classes`]: colours that no class explains become new classes, and the pieces are searched again.
 //!
 //! Works for pictures that were resized (whole map, same shape), saved with another pixel type or a palette,
 //! JPEG-compressed, or cropped with a world file.
 //!
 //! | symbol | meaning |
 //! |---|---|
-//! | d | distance of `p` from the colours of the base around the pixel |
+//! | d | distance of `p` from what the base would give |
 //! | t | tolerance: 3 grey levels a channel and [`NOISE_FACTOR`] times the median of `d`, which is noise of the file because most pixels are not painted |
 //! | r | what the mixture leaves unexplained: the distance of `p` from the line from `b` to `c` |
 //!
-//! Guarantee: a pixel only gets a class of which a *certain* pixel (`r <= t`, no other class nearly as good, mostly
-//! painted) lies within [`NEAR_PX`], so noise does not make classes; a picture with many pixels that belong nowhere is
-//! refused. In noisy files residuals are summed over a window of 5 x 5 pixels, because JPEG stores colour coarsely.
-//! Cost: O(pixels + painted pixels x classes).
+//! Guarantee: a pixel only gets a class of which a *certain* pixel (`r <= t`, no other class nearly as good, mostly painted) lies
+//! in its piece, so noise does not make classes; a picture with many pixels that belong nowhere is refused. In noisy files
+//! residuals are summed over a window of 5 x 5 pixels, because JPEG stores colour coarsely.
+//! Cost: O(pixels + painted pixels x classes x width of the kernel squared); memory for a piece beside the pictures.
 
 mod mixture;
 mod new_classes;
@@ -115,7 +116,7 @@ pub struct Recognised {
     pub smoothed_px: usize,
     /// Painted pixels without a class; they stay what they were.
     pub ambiguous_px: usize,
-    /// Pixels of the map on the border of two painted classes, which could be either; they stay what they were.
+    /// Painted pixels of the map that could as well have another class; they are unlabelled now.
     pub undecided_px: usize,
     /// Pixels of the map that are transparent in the edited picture: erased, so they are unlabelled now.
     pub erased_px: usize,
