@@ -188,7 +188,7 @@ pub fn recognise(
     if kept.len() < shown.len() - palette.len() {
         shown.truncate(palette.len());
         shown.extend(kept);
-        solve_again(&mut parts, &shown, &|part| part.painted > 0);
+        solve_again(&mut parts, &shown, &|part| part.painted > 0 || part.used.iter().any(|n| *n > 0));
     }
     let first_value = classes.iter().map(|c| c.value).max().unwrap_or(0) + 1;
     for (&color, value) in shown[palette.len()..].iter().zip(first_value..) {

@@ -94,7 +94,7 @@ impl Frame<'_> {
         let painted = Painted { picture: &picture, seen: &seen, classes: colors, rules: self.rules };
         let certain = certain(&painted);
         let erased = colors.len() as u16;
-        part.used = vec![0; colors.len() + 1];
+        part.used = vec![0; colors.len()];
         if certain.iter().all(Option::is_none) && seen.iter().all(|s| s.state != State::Erased) {
             let shares = vec![None; seen.len()];
             self.count(&window, &painted, &certain, &shares, &window.expected, &mut part);
@@ -135,7 +135,9 @@ impl Frame<'_> {
             );
             part.undecided += usize::from(doubtful[p]);
             let class = states[p] - 1;
-            part.used[usize::from(class)] += 1;
+            if class != erased {
+                part.used[usize::from(class)] += 1;
+            }
             part.labels[i] = if doubtful[p] || class == erased { Outcome::Unlabelled } else { Outcome::Class(class) };
         }
         if self.rules.mixed {
