@@ -38,3 +38,38 @@ for layer, name, width, colors in [
     small.save(target / f"{name}.png", optimize=True)
     print(target / f"{name}.png", small.size)
 PYTHON
+
+# Strokes and areas on the colour picture, saved at half its size, and what is recognised.
+python3 - "$work" <<'PYTHON'
+import json
+import sys
+from PIL import Image, ImageDraw
+
+work = sys.argv[1]
+picture = Image.open(f"{work}/run/map/color.png").convert("RGBA")
+classes = json.load(open(f"{work}/run/map/labels.json"))["classes"]
+red, blue, green = (tuple(c["color"]) for c in classes[1:4])
+width, height = picture.size
+x, y = width // 3, height // 3
+pen = ImageDraw.Draw(picture)
+pen.ellipse((x + 60, y + 60, x + 180, y + 140), fill=green)
+pen.line([(x + 20, y + 30), (x + 150, y + 90), (x + 330, y + 60), (x + 560, y + 150)], fill=red, width=3)
+pen.line([(x + 250, y + 10), (x + 300, y + 110), (x + 280, y + 190)], fill=blue, width=3)
+pen.line([(x + 340, y + 180), (x + 450, y + 40), (x + 580, y + 20)], fill=blue, width=3)
+picture.resize((width // 2, height // 2), Image.LANCZOS).save(f"{work}/painted.png")
+PYTHON
+cargo run --release --locked --quiet -- lift "$work/run" --labels "$work/painted.png" --out "$work/lifted.laz" --recognised "$work/seen.png"
+python3 - "$work" docs/pictures <<'PYTHON'
+import sys
+from PIL import Image
+
+work, target = sys.argv[1:]
+painted, seen = (Image.open(f"{work}/{name}.png").convert("RGB") for name in ("painted", "seen"))
+x, y = seen.width // 3, seen.height // 3
+part = painted.crop((x // 2, y // 2, x // 2 + 300, y // 2 + 100)).resize((600, 200), Image.NEAREST)
+both = Image.new("RGB", (600, 410), "white")
+both.paste(part, (0, 0))
+both.paste(seen.crop((x, y, x + 600, y + 200)), (0, 210))
+both.quantize(64, dither=Image.Dither.NONE).save(f"{target}/sample_paint.png", optimize=True)
+print(f"{target}/sample_paint.png", both.size)
+PYTHON

@@ -169,8 +169,11 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
         let _ = write!(told, "; {} between the classes were left as they were", found.ambiguous_px);
     }
     if found.undecided_px > 0 {
-        let _ =
-            write!(told, "; {} pixels of the map where two classes touch were left as they were", found.undecided_px);
+        let _ = write!(
+            told,
+            "; {} painted pixels of the map could be either of two classes and are unlabelled",
+            found.undecided_px
+        );
     }
     for entry in found.classes.iter().filter(|e| found.new_classes.contains(&e.value)) {
         let [r, g, b] = entry.color;

@@ -53,6 +53,21 @@ pub enum Error {
         /// Median difference of the colours.
         difference: f64,
     },
+    /// The palette of the picture shows two classes with one colour.
+    #[error(
+        "the palette of the picture shows '{one}' and '{other}' with the one colour {color}, so {ambiguous} painted pixels \
+         could be either: save the picture with full colours"
+    )]
+    OneColor {
+        /// The colour, as #rrggbb.
+        color: String,
+        /// A class.
+        one: String,
+        /// Another class.
+        other: String,
+        /// Painted pixels without a clear class.
+        ambiguous: usize,
+    },
     /// Too many painted pixels cannot be told.
     #[error(
         "{ambiguous} of {painted} painted pixels have colours between the classes, for example {color} at column \

@@ -1,8 +1,8 @@
 //! Painted pixels as mixtures of the base and the colour of a class: which class, and how much of the pixel.
 
-use super::compare::{Seen, State};
-use super::{NEW_COLOR, Rules, distance, rgb};
-use crate::map::{PaletteEntry, Picture};
+use super::window::{Seen, State};
+use super::{CERTAIN_SHARE_RESIZED, Rules, distance, rgb};
+use crate::map::Picture;
 
 /// A class is certain when the next one leaves this many times the tolerance more unexplained.
 const MARGIN: f64 = 0.5;
@@ -18,28 +18,22 @@ const CLEAR_BRIGHTNESS: f64 = 30.0;
 pub(super) struct Painted<'a> {
     pub(super) picture: &'a Picture,
     pub(super) seen: &'a [Seen],
-    pub(super) classes: &'a [PaletteEntry],
+    /// Colours of the classes.
+    pub(super) classes: &'a [[u8; 3]],
     pub(super) rules: &'a Rules,
 }
 
-/// What a painted pixel turns out to be.
-pub(super) enum Found {
-    /// Painted with one class or two (their places in the list) to these shares.
-    Paint([(u16, f64); 2]),
-    /// A difference that the file's own noise explains.
-    Noise,
-    /// Painted with something that is no class.
-    Nothing,
-}
+/// One class or two (their places in the list) that a pixel is painted with, and how much of it.
+pub(super) type Shares = [(u16, f64); 2];
 
 impl Painted<'_> {
     /// The class of a pixel whose colour leaves no doubt.
     pub(super) fn certain(&self, i: usize) -> Option<u16> {
         let mut best: Option<(f64, usize)> = None;
         let mut second = f64::INFINITY;
-        for (k, class) in self.classes.iter().enumerate() {
-            let (share, _) = self.unmix(i, class.color);
-            let residual = self.around(i, class.color);
+        for (k, &color) in self.classes.iter().enumerate() {
+            let (share, _) = self.unmix(i, color);
+            let residual = self.around(i, color);
             // A pixel that is mostly base says nothing about the class; it may still stand against another class.
             match best {
                 Some((b, _)) if residual >= b => second = second.min(residual),
@@ -59,11 +53,17 @@ impl Painted<'_> {
         (residual <= self.rules.tolerance && clear || distinct).then_some(k as u16)
     }
 
-    /// Whether the class of a pixel that seems certain is doubtful: two other classes near it with greater shares touch there
-    /// and explain the pixel as well, or a class of nearly the same colour prevails around.
+    /// Whether a class may explain most of a pixel.
+    pub(super) fn is_plausible(&self, i: usize, class: u16) -> bool {
+        let color = self.classes[usize::from(class)];
+        self.unmix(i, color).0 >= CERTAIN_SHARE_RESIZED && self.around(i, color) <= BLURRED * self.rules.tolerance
+    }
+
+    /// Whether the class of a pixel that seems certain is doubtful: two other classes that prevail around or have greater shares
+    /// there explain the pixel as well, or a class of nearly the same colour prevails around.
     pub(super) fn is_doubtful(&self, i: usize, certain: &[Option<u16>]) -> bool {
         let Some(own) = certain[i] else { return false };
-        let color = |class: u16| self.classes[usize::from(class)].color;
+        let color = |class: u16| self.classes[usize::from(class)];
         let (share, residual) = self.unmix(i, color(own));
         // Class, pixels of it, and whether one of them holds more of it than this one of its own.
         let mut near: Vec<(u16, usize, bool)> = Vec::new();
@@ -80,7 +80,7 @@ impl Painted<'_> {
         if near.iter().filter(prevails).any(|c| distance(color(c.0), color(own)) < ALIKE) {
             return true;
         }
-        let stronger: Vec<u16> = near.iter().filter(|c| c.2).map(|c| c.0).collect();
+        let stronger: Vec<u16> = near.iter().filter(|c| c.2 || prevails(c)).map(|c| c.0).collect();
         stronger.iter().enumerate().any(|(k, &a)| {
             stronger[..k].iter().any(|&b| {
                 let (_, pair) = unmix(rgb(self.picture, i), color(a), color(b), self.rules);
@@ -90,30 +90,31 @@ impl Painted<'_> {
     }
 
     /// Pixels of the picture within a distance in columns and rows, row by row.
-    fn around_px(&self, i: usize, reach: usize) -> impl Iterator<Item = usize> + use<> {
+    pub(super) fn around_px(&self, i: usize, reach: usize) -> impl Iterator<Item = usize> + use<> {
         let (width, height) = (self.picture.width, self.picture.height);
         let (x, y) = (i % width, i / width);
         (y.saturating_sub(reach)..(y + reach + 1).min(height))
             .flat_map(move |ny| (x.saturating_sub(reach)..(x + reach + 1).min(width)).map(move |nx| ny * width + nx))
     }
 
-    /// Painted share of a pixel: with its own class if that is certain, else with one that is certain near it.
-    pub(super) fn share(&self, i: usize, certain: &[Option<u16>]) -> Found {
+    /// Painted share of a pixel: with its own class if that is certain, else with one or two that are certain near it.
+    /// Gives what that leaves unexplained, too.
+    pub(super) fn share(&self, i: usize, certain: &[Option<u16>]) -> Option<(f64, Shares)> {
         if let Some(class) = certain[i] {
             // In a picture of the same size a certain pixel is painted as a whole.
-            let share = self.unmix(i, self.classes[usize::from(class)].color).0.max(0.5);
-            return Found::Paint([(class, share), (class, 0.0)]);
+            let (share, residual) = self.unmix(i, self.classes[usize::from(class)]);
+            return Some((residual, [(class, share.max(0.5)), (class, 0.0)]));
         }
         let mut near: Vec<u16> = self.around_px(i, self.rules.near).filter_map(|n| certain[n]).collect();
         near.sort_unstable();
         near.dedup();
-        let mut best: Option<(f64, [(u16, f64); 2])> = None;
-        let mut better = |residual: f64, paint: [(u16, f64); 2]| {
+        let mut best: Option<(f64, Shares)> = None;
+        let mut better = |residual: f64, paint: Shares| {
             if best.is_none_or(|(r, _)| residual < r) {
                 best = Some((residual, paint));
             }
         };
-        let color = |class: u16| self.classes[usize::from(class)].color;
+        let color = |class: u16| self.classes[usize::from(class)];
         for (k, &a) in near.iter().enumerate() {
             let (share, residual) = self.unmix(i, color(a));
             better(residual, [(a, share), (a, 0.0)]);
@@ -123,14 +124,7 @@ impl Painted<'_> {
                 better(residual + 0.5 * self.rules.tolerance, [(a, share), (b, 1.0 - share)]);
             }
         }
-        let difference = distance(rgb(self.picture, i), self.seen[i].base);
-        // A mixture may also hold what the map showed beside the pixel, so it is judged less strictly than full colours.
-        let slack = 2.0 * self.rules.tolerance + NEW_COLOR;
-        match best {
-            Some((residual, paint)) if residual <= slack.max(0.5 * difference) => Found::Paint(paint),
-            _ if self.seen[i].edge || self.rules.mixed && difference <= slack + NEW_COLOR => Found::Noise,
-            _ => Found::Nothing,
-        }
+        best
     }
 
     /// Root mean square of the residuals of a class around a pixel.
