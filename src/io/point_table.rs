@@ -63,6 +63,16 @@ impl Roles {
             label,
         }))
     }
+
+    /// Whether a column means anything.
+    pub(super) fn use_column(&self, column: usize) -> bool {
+        let labels = matches!(&self.label, LabelSource::Column { index, .. } if *index == column);
+        let single = [self.intensity, self.classification, self.source_id];
+        labels
+            || self.position.contains(&column)
+            || self.color.is_some_and(|(channels, _)| channels.contains(&column))
+            || single.contains(&Some(column))
+    }
 }
 
 /// Says how many records gave no point.
