@@ -4,6 +4,7 @@
 use super::assemble::contained;
 use super::detect::{self, Format};
 use super::error::{COPY_AGAIN, Error};
+use super::part::Part;
 use super::source_bytes::SourceBytes;
 use super::{e57, las, pcd, ply};
 use serde::Serialize;
@@ -39,6 +40,14 @@ const STL_HEADER: u64 = 84;
 /// # Errors
 /// [`Error`] when the file cannot be opened, its header does not read, or the file is shorter than its header says.
 pub fn announce(path: &Path) -> Result<Announcement, Error> {
+    announce_part(path, None)
+}
+
+/// As [`announce`]; of a COPC only the points that may lie in `part` are counted. Other formats tell nothing about parts.
+///
+/// # Errors
+/// As [`announce`].
+pub fn announce_part(path: &Path, part: Option<&Part>) -> Result<Announcement, Error> {
     contained(path, || {
         let source = SourceBytes::open(path)?;
         let bytes = source.len();
@@ -46,7 +55,7 @@ pub fn announce(path: &Path) -> Result<Announcement, Error> {
         let estimated = |points| Announcement { points, counted: false, bytes, bounds_m: None };
         Ok(match detect::format_of(&source)? {
             Format::Las => {
-                let (points, bounds_m) = las::announced_points(&source)?;
+                let (points, bounds_m) = las::announced_points(&source, part)?;
                 Announcement { bounds_m, ..counted(points) }
             }
             Format::E57 => counted(e57::announced_points(&source)?),
@@ -101,7 +110,7 @@ mod tests {
             first_point: 0,
             point_count: points,
             record_count: points as u64,
-            dropped_records: Vec::new(),
+            dropped_records: Default::default(),
         }];
         Cloud::new(ScanFrame::local(), positions, Attributes::default(), sources, Vec::new()).unwrap()
     }

@@ -568,7 +568,7 @@ fn assemble(plan: &ScanPlan, stations: &[Vec3], shots: Vec<(usize, Vec<Shot>)>) 
         first_point: 0,
         point_count: shots.len(),
         record_count: shots.len() as u64,
-        dropped_records: Vec::new(),
+        dropped_records: Default::default(),
     };
     let named = stations
         .iter()

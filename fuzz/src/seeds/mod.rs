@@ -84,7 +84,7 @@ fn written(name: &str, n: usize, with_attributes: bool) -> Vec<u8> {
         first_point: 0,
         point_count: n,
         record_count: n as u64,
-        dropped_records: vec![],
+        dropped_records: Default::default(),
     };
     let frame = ScanFrame::with_origin(Vec3::new(244_300.0, 6_010_900.0, 0.0));
     let cloud = Cloud::new(frame, positions, attributes, vec![source], vec![]).expect("equal columns");

@@ -25,7 +25,7 @@ pub(in super::super) fn stream(
     let opened = Opened::new(source, settings, None)?;
     let chunks = match scope.window.and_then(|w| Some((w, Nodes::of(source, &opened.container)?))) {
         Some((window, nodes)) => {
-            opened.records.chunks.iter().copied().filter(|c| nodes.may_meet(c.begins_at(), window)).collect()
+            opened.records.chunks.iter().copied().filter(|c| nodes.may_hold(c.begins_at(), |node| node.meets(window))).collect()
         }
         None => opened.records.chunks.clone(),
     };
