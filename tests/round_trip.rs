@@ -1,7 +1,7 @@
 //! Read, write, and let an independent reader compare: laspy, where a Python with it is present.
 //!
 //! `ADIT_TEST_PYTHON` names the Python (default `python3`); `ADIT_ROUND_TRIP_FOLDER` adds all LAS and LAZ files of a
-//! folder to those that are made here.
+//! folder and of the folders in it to those that are made here.
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
 
@@ -32,11 +32,15 @@ fn rewrite(cloud: &Cloud, to: &Path) {
 }
 
 fn las_files(folder: &Path) -> Vec<PathBuf> {
-    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|p| p.extension().is_some_and(|e| e == "las" || e == "laz"))
-        .collect();
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(las_files(&path));
+        } else if path.extension().is_some_and(|e| e == "las" || e == "laz") {
+            files.push(path);
+        }
+    }
     files.sort();
     files
 }

@@ -57,6 +57,10 @@ impl Target {
     }
 }
 
+fn is_finite(position: Vec3) -> bool {
+    position.iter().all(|c| c.is_finite())
+}
+
 /// What a reader makes of an input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
@@ -91,6 +95,9 @@ pub fn read(target: Target, bytes: &[u8]) -> Outcome {
             as_mesh();
         }
         match io::read_cloud(std::slice::from_ref(&path), &lenient) {
+            Ok((cloud, _)) if !cloud.stations().iter().filter_map(|s| s.position_in_local).all(is_finite) => {
+                panic!("a station without a place has one")
+            }
             Ok((_, summary)) if summary.warnings.iter().any(|w| w.code == "truncated") => Outcome::Partial,
             Ok(_) => Outcome::Accepted,
             Err(_) => Outcome::Refused,

@@ -69,9 +69,8 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let mut entries = vec![entry(&stations[0], stations[0].pose, "the first scan stays".to_owned())];
     for station in &stations[1..] {
         let moving = local(station);
-        let found = register::align(&Surface::new(&fixed), &moving, arguments.distance).map_err(|error| {
-            Failure::message(Exit::BadInput, format!("{station} cannot be registered: {error}"))
-        })?;
+        let found = register::align(&Surface::new(&fixed), &moving, arguments.distance)
+            .map_err(|error| Failure::message(Exit::BadInput, format!("{station} cannot be registered: {error}")))?;
         let turn = nalgebra::Rotation3::from_matrix_unchecked(found.motion.rotation).angle().to_degrees();
         let remark = format!(
             "moved by {:.1} mm and turned by {turn:.4} degrees in {} iterations\nbefore: {}\nafter: {}",

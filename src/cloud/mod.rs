@@ -34,13 +34,13 @@ impl SourceFile {
     }
 }
 
-/// A scanner position known from the file (E57 or PTX pose).
+/// A scan of one scanner setup that a file tells apart from others (E57, PTX, PCD).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Station {
     /// Name from the file, or a generated one.
     pub name: String,
-    /// Position of the scanner in local metres.
-    pub position_in_local: Vec3,
+    /// Position of the scanner in local metres, if the file tells it.
+    pub position_in_local: Option<Vec3>,
 }
 
 /// The optional attribute columns; each is as long as the cloud when present.

@@ -85,11 +85,7 @@ pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summ
 ///
 /// # Errors
 /// As [`read_cloud`]; also when the scan is in another unit than the part, or nothing of it lies in the part.
-pub fn read_part(
-    files: &[PathBuf],
-    settings: &Settings,
-    part: Option<&Part>,
-) -> Result<(Cloud, Summary), Error> {
+pub fn read_part(files: &[PathBuf], settings: &Settings, part: Option<&Part>) -> Result<(Cloud, Summary), Error> {
     let mut whole: Option<Whole> = None;
     let mut warnings = Vec::new();
     let poses = settings.poses.as_deref().map(Poses::read).transpose()?.unwrap_or_default();
@@ -295,7 +291,8 @@ impl Whole {
         context.column("stations", &mut mine.station_ids, ids, u16::MAX, Some("unknown"), warnings);
         self.scan.stations.extend(stations);
         let dropped = dropped_records;
-        let row = Row { first_point: before, points: added, records: record_count, dropped, outside_part, info, guards };
+        let row =
+            Row { first_point: before, points: added, records: record_count, dropped, outside_part, info, guards };
         self.note(path, row);
         Ok(())
     }
@@ -324,7 +321,7 @@ impl Whole {
         let metres_per_unit = unit_of(&scan, settings, &mut warnings);
         if metres_per_unit != 1.0 {
             scan.positions.iter_mut().for_each(|p| *p *= metres_per_unit);
-            scan.stations.iter_mut().for_each(|s| s.position_in_local *= metres_per_unit);
+            scan.stations.iter_mut().filter_map(|s| s.position_in_local.as_mut()).for_each(|p| *p *= metres_per_unit);
         } else if settings.unit.is_none() {
             warnings.extend(unit_guess::of(&(high - low), &sample));
         }
@@ -339,7 +336,7 @@ impl Whole {
             origin_in_scan: scan.origin.into(),
             bounds_in_scan: [low.into(), high.into()],
             crs,
-            stations: known.len(),
+            stations: known.iter().filter(|s| s.position_in_local.is_some()).count(),
             overlaps: Vec::new(),
             files,
             warnings,

@@ -142,7 +142,7 @@ pub(super) struct FileScan {
 }
 
 impl FileScan {
-    /// Adds scanner positions and, for each record, the scanner that saw it.
+    /// Adds stations and, for each record, the one that saw it.
     pub(super) fn set_stations(&mut self, stations: Vec<Station>, mut station_of_record: Vec<u16>) {
         let mut records = 0..;
         station_of_record.retain(|_| records.next().is_some_and(|r| self.dropped_records.point_of(r).is_some()));
@@ -173,8 +173,8 @@ impl FileScan {
         if self.origin != Vec3::zeros() {
             self.positions.iter_mut().for_each(|p| *p -= self.origin);
         }
-        for station in &mut self.stations {
-            station.position_in_local -= self.origin;
+        for position in self.stations.iter_mut().filter_map(|s| s.position_in_local.as_mut()) {
+            *position -= self.origin;
         }
         self
     }

@@ -33,7 +33,10 @@ impl Part {
             remedy: remedy.to_owned(),
         };
         if !(from < to && from.is_finite() && to.is_finite()) {
-            return Err(refused(format!("{from} to {to} is no stretch"), "give two finite numbers, the smaller one first"));
+            return Err(refused(
+                format!("{from} to {to} is no stretch"),
+                "give two finite numbers, the smaller one first",
+            ));
         }
         let (start, end) = (axis.start_chainage(), axis.end_chainage());
         if to <= start || from >= end {

@@ -158,7 +158,6 @@ impl Pose {
     pub(super) fn apply_to(&self, point: &Vec3) -> Vec3 {
         self.rotation * point + self.translation
     }
-
 }
 
 impl FilePoses {
@@ -199,12 +198,12 @@ impl FilePoses {
         }
         if scan.stations.is_empty() {
             let name = path.file_stem().map_or_else(String::new, |s| s.to_string_lossy().into_owned());
-            scan.stations = vec![Station { name, position_in_local: self.of_station(None).translation }];
+            scan.stations = vec![Station { name, position_in_local: Some(self.of_station(None).translation) }];
             scan.attributes.station_ids = Some(vec![0; scan.positions.len()]);
         } else {
             for (i, station) in scan.stations.iter_mut().enumerate() {
                 let pose = self.of_station(u16::try_from(i).ok());
-                station.position_in_local = pose.apply_to(&(station.position_in_local + from));
+                station.position_in_local = station.position_in_local.map(|p| pose.apply_to(&(p + from)));
             }
         }
         scan.origin = Vec3::zeros();

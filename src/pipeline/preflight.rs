@@ -58,7 +58,8 @@ impl Need {
     /// # Errors
     /// As [`io::announce`]: a file is missing, damaged or shorter than its header says.
     pub fn of(files: &[PathBuf], pipeline: &Pipeline) -> Result<Self, super::Error> {
-        let part = super::run::part_of(pipeline)?;
+        // Files with poses are read whole.
+        let part = super::run::part_of(pipeline)?.filter(|_| pipeline.ingest.poses.is_none());
         let told = files.iter().map(|f| io::announce_part(f, part.as_ref()));
         let told: Vec<Announcement> = told.collect::<Result<_, _>>().map_err(super::Error::in_stage("ingest"))?;
         // A file that is no mesh and no scan is told when it is read.

@@ -611,7 +611,8 @@ pub(super) fn part_of(pipeline: &Pipeline) -> Result<Option<io::Part>, Error> {
         ..ScanFrame::with_origin(Vec3::zeros())
     };
     let text = read_alignment("ingest", path)?;
-    let (axis, _) = axis::import_csv(&text, &frame, &pipeline.axis.in_local(&frame)).map_err(Error::in_stage("ingest"))?;
+    let (axis, _) =
+        axis::import_csv(&text, &frame, &pipeline.axis.in_local(&frame)).map_err(Error::in_stage("ingest"))?;
     io::Part::along(axis, frame, chainage_m).map(Some).map_err(Error::in_stage("ingest"))
 }
 

@@ -139,9 +139,11 @@ fn compress(records: &[u8], record_len: usize, vlr: LazVlr, points_at: usize, va
     let mut compressor = LasZipCompressor::new(&mut bytes, vlr).expect("items of a point format");
     match variable {
         Some(chunk) => {
-            for run in records.chunks(chunk * record_len) {
+            for (i, run) in records.chunks(chunk * record_len).enumerate() {
+                if i > 0 {
+                    compressor.finish_current_chunk().expect("bytes in memory");
+                }
                 compressor.compress_many(run).expect("bytes in memory");
-                compressor.finish_current_chunk().expect("bytes in memory");
             }
         }
         None => compressor.compress_many(records).expect("bytes in memory"),

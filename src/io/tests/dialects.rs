@@ -32,7 +32,8 @@ fn columns_of_words_stand_beside_the_coordinates() {
     let (cloud, summary) = scan("a.csv", b"code,x,y,z,surveyed\nwall,1,2,3,2024-01-01 10:00\nfloor,4,5,6,\n");
     assert_eq!(in_scan(&cloud), [Vec3::new(1.0, 2.0, 3.0), Vec3::new(4.0, 5.0, 6.0)]);
     assert!(summary.warnings.iter().all(|w| w.code != "skipped-lines"), "{:?}", summary.warnings);
-    let error = read_bytes("a.csv", b"code,x,y,z\na,1,2,3\nb,4,five,6\n", &Settings::default()).unwrap_err().to_string();
+    let error =
+        read_bytes("a.csv", b"code,x,y,z\na,1,2,3\nb,4,five,6\n", &Settings::default()).unwrap_err().to_string();
     assert!(error.contains("line 3: 'five' is not a number"), "{error}");
 }
 
@@ -84,6 +85,52 @@ fn pcd_headers_that_disagree_are_told() {
     assert_eq!(summary.warnings.iter().filter(|w| w.code == "pcd-header").count(), 2, "{:?}", summary.warnings);
 }
 
+/// A scan without a pose is a station all the same; where it was seen from is not known.
+#[test]
+fn e57_scans_without_poses_are_stations_without_a_place() {
+    use ::e57::{E57Writer, Record, RecordValue};
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.e57");
+    let mut writer = E57Writer::from_file(&path, "file").unwrap();
+    for scan in ["one", "two"] {
+        let prototype = vec![Record::CARTESIAN_X_F64, Record::CARTESIAN_Y_F64, Record::CARTESIAN_Z_F64];
+        let mut points = writer.add_pointcloud(scan, prototype).unwrap();
+        points.add_point([1.0, 2.0, 3.0].map(RecordValue::Double).to_vec()).unwrap();
+        points.finalize().unwrap();
+    }
+    writer.finalize().unwrap();
+    let (cloud, summary) = read(&path);
+    assert_eq!(cloud.attributes().station_ids.as_deref(), Some(&[0, 1][..]));
+    assert_eq!((cloud.stations().len(), cloud.stations()[1].position_in_local, summary.stations), (2, None, 0));
+    assert_eq!(read_stations(&path, &Settings::default()).unwrap().len(), 2);
+}
+
+/// Floating point intensities and colours may go without limits; the decoder makes zeros of them.
+#[test]
+fn e57_values_without_limits_keep_their_ratios() {
+    use ::e57::{E57Writer, Record, RecordDataType, RecordName, RecordValue};
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.e57");
+    let free = RecordDataType::Double { min: None, max: None };
+    let mut prototype = vec![Record::CARTESIAN_X_F64, Record::CARTESIAN_Y_F64, Record::CARTESIAN_Z_F64];
+    prototype.extend(
+        [RecordName::Intensity, RecordName::ColorRed, RecordName::ColorGreen, RecordName::ColorBlue]
+            .map(|name| Record { name, data_type: free.clone() }),
+    );
+    let mut writer = E57Writer::from_file(&path, "file").unwrap();
+    let mut points = writer.add_pointcloud("scan", prototype).unwrap();
+    for (intensity, red) in [(-30.0, 255.0), (-10.0, 0.0), (10.0, 51.0)] {
+        points.add_point([1.0, 2.0, 3.0, intensity, red, 0.0, 102.0].map(RecordValue::Double).to_vec()).unwrap();
+    }
+    points.finalize().unwrap();
+    writer.finalize().unwrap();
+    let (cloud, summary) = read(&path);
+    assert_eq!(cloud.attributes().intensities.as_deref(), Some(&[0, 32_768, 65_535][..]));
+    let colors = cloud.attributes().colors.as_deref().unwrap();
+    assert_eq!(colors, [[65_535, 0, 26_214], [0, 0, 26_214], [13_107, 0, 26_214]]);
+    assert!(summary.warnings.iter().any(|w| w.code == "intensity-range"), "{:?}", summary.warnings);
+}
+
 /// A GLB with one primitive of `mode` over the corners of a square, shown by `copies` nodes.
 fn glb(mode: u64, copies: usize) -> Vec<u8> {
     let nodes: Vec<usize> = (0..copies).collect();
@@ -125,7 +172,8 @@ fn a_glb_that_shows_its_mesh_too_often_is_refused() {
 fn two_stations() -> Vec<u8> {
     let texts = [station(1, |p| p), station(2, |p| p + Vec3::new(0.0, 0.0, 0.03))];
     let scan = |text: &String| {
-        let head = format!("1\n{}\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", text.lines().count());
+        let head =
+            format!("1\n{}\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", text.lines().count());
         head + text
     };
     texts.iter().map(scan).collect::<String>().into_bytes()
@@ -153,7 +201,7 @@ fn scans_in_one_file_are_stations_with_poses_of_their_own() {
     let settings = Settings { poses: Some(poses.clone()), ..Default::default() };
     let (cloud, summary) = read_cloud(std::slice::from_ref(&path), &settings).unwrap();
     assert!(summary.overlaps[0].overlap.median_m < 0.005, "{:?}", summary.overlaps);
-    let z: Vec<f64> = cloud.stations().iter().map(|s| cloud.frame().scan_from_local(&s.position_in_local).z).collect();
+    let z: Vec<f64> = cloud.stations().iter().map(|s| cloud.frame().scan_from_local(&s.position_in_local.unwrap()).z).collect();
     assert_eq!(z, [0.0, -0.03]);
     assert!((read_stations(&path, &settings).unwrap()[1].pose.translation.z + 0.03).abs() < 1e-12);
 

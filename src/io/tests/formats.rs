@@ -70,7 +70,7 @@ fn ptx_poses_and_lost_echoes() {
     assert_eq!(in_scan(&cloud), [Vec3::new(10.0, 21.0, 30.0), Vec3::new(0.0, 1.0, 5.0)]);
     assert_eq!(cloud.sources()[0].dropped_records, [1].into_iter().collect());
     assert_eq!(cloud.attributes().station_ids.as_deref(), Some(&[0, 1][..]));
-    assert_eq!(cloud.stations()[0].position_in_local, Vec3::new(10.0, 20.0, 30.0));
+    assert_eq!(cloud.stations()[0].position_in_local, Some(Vec3::new(10.0, 20.0, 30.0)));
     assert_eq!(summary.files[0].dropped, 1);
 }
 
@@ -117,7 +117,7 @@ fn pcd_binary_and_compressed_agree() {
     assert_eq!(a.attributes().colors.as_deref(), Some(&[[65535, 128 * 257, 0], [0, 0, 65535]][..]));
     assert_eq!(a.attributes().labels.as_deref(), Some(&[7, 9][..]));
     assert_eq!((a.positions(), a.attributes()), (b.positions(), b.attributes()));
-    assert_eq!(a.stations()[0].position_in_local, Vec3::new(1.0, 2.0, 3.0));
+    assert_eq!(a.stations()[0].position_in_local, Some(Vec3::new(1.0, 2.0, 3.0)));
 }
 
 #[test]
@@ -150,7 +150,7 @@ fn e57_poses_and_invalid_points() {
         assert!((p - expected).amax() < 1e-12, "{p}");
     }
     assert_eq!((cloud.len(), summary.files[0].dropped), (2, 1));
-    assert_eq!(cloud.stations()[0].position_in_local, Vec3::new(100.0, 200.0, 300.0));
+    assert_eq!(cloud.stations()[0].position_in_local, Some(Vec3::new(100.0, 200.0, 300.0)));
 }
 
 #[test]
@@ -258,7 +258,7 @@ fn poses_from_a_file() {
     let settings = Settings { poses: Some(poses.clone()), ..Default::default() };
     let (cloud, _) = read_cloud(std::slice::from_ref(&scan), &settings).unwrap();
     assert_eq!(in_scan(&cloud), [Vec3::new(500_000.0, 1.0, 2.0), Vec3::new(500_000.0, 2.0, 2.0)]);
-    let station = cloud.frame().scan_from_local(&cloud.stations()[0].position_in_local);
+    let station = cloud.frame().scan_from_local(&cloud.stations()[0].position_in_local.unwrap());
     assert_eq!(station, Vec3::new(500_000.0, 0.0, 2.0));
     std::fs::write(&poses, pose.replacen("-1.0", "1.0", 1)).unwrap();
     let error = read_cloud(&[scan], &settings).unwrap_err();

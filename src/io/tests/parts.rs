@@ -119,7 +119,8 @@ fn a_stretch_of_chainage_is_the_same_part_of_every_format() {
 fn a_part_that_is_not_there_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let made = Made { scale: [0.01; 3], ..Made::new(4, 6, 200) };
-    for (stretch, told) in [([5.0, 5.0], "no stretch"), ([f64::NAN, 5.0], "no stretch"), ([9e5, 9.1e5], "outside the")] {
+    for (stretch, told) in [([5.0, 5.0], "no stretch"), ([f64::NAN, 5.0], "no stretch"), ([9e5, 9.1e5], "outside the")]
+    {
         let error = part(&made, stretch).unwrap_err();
         assert!(error.kind() == ErrorKind::Settings && error.to_string().contains(told), "{error}");
     }

@@ -77,7 +77,9 @@ pub(super) fn detect(head: &[u8], wanted: Option<&[String]>) -> Result<Layout, S
     let promised = before.iter().find(|l| !is_void(l)).and_then(|l| count_of(l));
     let is_header = |at: usize| wanted.is_none() && header.as_ref().is_some_and(|h| h.at == at);
     let skipped: Vec<&[u8]> = (0..first_data)
-        .filter(|&i| !is_void(lines[i]) && !is_header(i) && header_of(i, lines[i]).is_none() && count_of(lines[i]).is_none())
+        .filter(|&i| {
+            !is_void(lines[i]) && !is_header(i) && header_of(i, lines[i]).is_none() && count_of(lines[i]).is_none()
+        })
         .map(|i| lines[i])
         .collect();
     Ok(Layout {
@@ -137,7 +139,8 @@ fn header_of(at: usize, text: &[u8]) -> Option<Header> {
         let degrees = match (place("x"), place("y"), place("z")) {
             (Some(_), Some(_), Some(_)) => false,
             (None, None, Some(_)) => {
-                let angle = |wanted: &[&str]| wanted.iter().find_map(|w| names.iter().position(|n| n.eq_ignore_ascii_case(w)));
+                let angle =
+                    |wanted: &[&str]| wanted.iter().find_map(|w| names.iter().position(|n| n.eq_ignore_ascii_case(w)));
                 let (east, north) = (angle(&["lon", "long", "lng", "longitude"])?, angle(&["lat", "latitude"])?);
                 (names[east], names[north]) = ("x".to_owned(), "y".to_owned());
                 true

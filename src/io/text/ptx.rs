@@ -120,7 +120,7 @@ pub(in super::super) fn read(
             rotation * p + translation
         });
         station_ids.resize(station_ids.len() + table.len(), stations.len() as u16);
-        stations.push(Station { name: format!("scan {}", stations.len() + 1), position_in_local: translation });
+        stations.push(Station { name: format!("scan {}", stations.len() + 1), position_in_local: Some(translation) });
         grids.push([head.columns, head.rows]);
         match &mut all {
             None => all = Some((table, head.fields)),
@@ -211,8 +211,7 @@ fn read_head(source: &SourceBytes, at: u64, line_number: u64) -> Result<Option<H
     // The window may cut off the last line.
     let whole = |line: &&[u8]| head.len() < WINDOW || line.ends_with(b"\n");
     let points = usize::try_from(columns.saturating_mul(rows)).unwrap_or(usize::MAX);
-    let first: Vec<Vec<f64>> =
-        lines.filter(whole).map_while(words).filter(|w| !w.is_empty()).take(points).collect();
+    let first: Vec<Vec<f64>> = lines.filter(whole).map_while(words).filter(|w| !w.is_empty()).take(points).collect();
     let fields = Fields::of(&first).map_err(|cause| {
         let cause = format!("line {}: {cause}", line_number + 10);
         Error::unsupported(source.path(), cause, "export it with lines `x y z intensity` or `x y z intensity r g b`")

@@ -44,8 +44,14 @@ pub(in super::super) fn read(
             format!("{count} {what} neither numbers nor a header and skipped, before the first point: '{first}'"),
         ));
     }
-    let (mut table, end, line) =
-        parse_rows(source, text.start + layout.header_bytes, layout.header_lines + 1, layout.promised, &layout.line, &roles)?;
+    let (mut table, end, line) = parse_rows(
+        source,
+        text.start + layout.header_bytes,
+        layout.header_lines + 1,
+        layout.promised,
+        &layout.line,
+        &roles,
+    )?;
     if let Some(promised) = layout.promised {
         if (table.len() as u64) < promised {
             let cause = format!("its first line promises {promised} points, but {} follow", table.len());
