@@ -1,7 +1,6 @@
 //! Files that Adit does not write itself: every version with every point format, extra bytes of every type, waveform
 //! and extended records, several chunk forms of LAZ. Made here byte by byte, so that nothing comes from elsewhere.
 
-use super::super::las;
 use super::*;
 use crate::io::{ScanBox, stream_positions};
 
@@ -16,11 +15,16 @@ pub(super) struct Made {
     points: usize,
     /// Types of the extra bytes, by their codes.
     extra: &'static [u8],
-    pub(super) scale: [f64; 3],
+    scale: [f64; 3],
     extended_records: bool,
 }
 
 impl Made {
+    /// The same with coordinates in other steps.
+    pub(super) fn in_steps(self, step: f64) -> Self {
+        Self { scale: [step; 3], ..self }
+    }
+
     pub(super) fn new(minor: u8, format: u8, points: usize) -> Self {
         Self { minor, format, points, extra: &[], scale: [0.001, 0.002, 0.0005], extended_records: false }
     }

@@ -59,7 +59,7 @@ fn damage(path: &Path, second_chunk: u64) {
 fn the_index_of_copc_leaves_out_what_lies_elsewhere() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.copc.laz");
-    let made = Made { scale: [0.01; 3], ..Made::new(4, 6, 200) };
+    let made = Made::new(4, 6, 200).in_steps(0.01);
     let second_chunk = copc(&path, &made);
     let (cloud, _) = read(&path);
     let middle = made.position(100);
@@ -85,7 +85,7 @@ fn part(made: &Made, chainage_m: [f64; 2]) -> Result<Part, Error> {
 #[test]
 fn a_stretch_of_chainage_is_the_same_part_of_every_format() {
     let folder = tempfile::tempdir().unwrap();
-    let made = Made { scale: [0.01; 3], ..Made::new(4, 6, 200) };
+    let made = Made::new(4, 6, 200).in_steps(0.01);
     let path = folder.path().join("a.copc.laz");
     let second_chunk = copc(&path, &made);
     let (whole, _) = read(&path);
@@ -118,7 +118,7 @@ fn a_stretch_of_chainage_is_the_same_part_of_every_format() {
 #[test]
 fn a_part_that_is_not_there_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let made = Made { scale: [0.01; 3], ..Made::new(4, 6, 200) };
+    let made = Made::new(4, 6, 200).in_steps(0.01);
     for (stretch, told) in [([5.0, 5.0], "no stretch"), ([f64::NAN, 5.0], "no stretch"), ([9e5, 9.1e5], "outside the")]
     {
         let error = part(&made, stretch).unwrap_err();
