@@ -143,7 +143,10 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     let mut scan = table.finish_absolute(&roles, info, warnings, "a coordinate that is not a number");
     if header.viewpoint != Vec3::zeros() {
         let n = scan.record_count as usize;
-        scan.set_stations(vec![Station { name: "viewpoint".into(), position_in_local: Some(header.viewpoint) }], vec![0; n]);
+        scan.set_stations(
+            vec![Station { name: "viewpoint".into(), position_in_local: Some(header.viewpoint) }],
+            vec![0; n],
+        );
     }
     Ok(scan.relative(origin))
 }

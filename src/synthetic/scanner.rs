@@ -642,7 +642,8 @@ mod tests {
         let mut sum = 0.0;
         for (i, p) in scan.cloud.positions().iter().enumerate() {
             let hit = tunnel.surface_point(scan.truth.chainage_m[i], scan.truth.girth_m[i]);
-            let from = stations[scan.cloud.attributes().station_ids.as_ref().unwrap()[i] as usize].position_in_local.unwrap();
+            let from =
+                stations[scan.cloud.attributes().station_ids.as_ref().unwrap()[i] as usize].position_in_local.unwrap();
             sum += ((p - from).norm() - (hit - from).norm()).powi(2);
         }
         let sigma = (sum / scan.cloud.len() as f64).sqrt();

@@ -201,7 +201,8 @@ fn scans_in_one_file_are_stations_with_poses_of_their_own() {
     let settings = Settings { poses: Some(poses.clone()), ..Default::default() };
     let (cloud, summary) = read_cloud(std::slice::from_ref(&path), &settings).unwrap();
     assert!(summary.overlaps[0].overlap.median_m < 0.005, "{:?}", summary.overlaps);
-    let z: Vec<f64> = cloud.stations().iter().map(|s| cloud.frame().scan_from_local(&s.position_in_local.unwrap()).z).collect();
+    let z: Vec<f64> =
+        cloud.stations().iter().map(|s| cloud.frame().scan_from_local(&s.position_in_local.unwrap()).z).collect();
     assert_eq!(z, [0.0, -0.03]);
     assert!((read_stations(&path, &settings).unwrap()[1].pose.translation.z + 0.03).abs() < 1e-12);
 

@@ -26,7 +26,6 @@ pub(super) struct Layout {
 
 /// What a header line says.
 struct Header {
-    at: usize,
     names: Vec<String>,
     degrees: bool,
 }
@@ -39,11 +38,11 @@ pub(super) fn detect(head: &[u8], wanted: Option<&[String]>) -> Result<Layout, S
         lines.pop();
     }
     const NO_NUMBERS: &str = "no line of at least three numbers was found at its beginning";
-    let header = lines.iter().enumerate().find_map(|(at, line)| header_of(at, line));
+    let header = lines.iter().enumerate().find_map(|(at, line)| Some((at, header_of(line)?)));
     let coordinates = |names: &[String]| -> Vec<usize> {
         ["x", "y", "z"].iter().filter_map(|c| names.iter().position(|n| n == c)).collect()
     };
-    let (first_data, mut line, names, origin) = if let Some(wanted) = wanted {
+    let (first_data, line, mut names, origin) = if let Some(wanted) = wanted {
         let names: Vec<String> = wanted.iter().map(|n| if n == "skip" { String::new() } else { n.clone() }).collect();
         let needed: Vec<usize> = (0..names.len()).filter(|&i| !names[i].is_empty()).collect();
         let found = first_line(&lines, 0, Some(&needed)).filter(|(_, line)| line.columns >= wanted.len());
@@ -52,36 +51,23 @@ pub(super) fn detect(head: &[u8], wanted: Option<&[String]>) -> Result<Layout, S
             None => NO_NUMBERS.to_owned(),
         })?;
         (at, Line { columns: wanted.len(), ..line }, names, "settings")
-    } else if let Some(header) = &header {
-        let (at, line) = first_line(&lines, header.at + 1, Some(&coordinates(&header.names)))
+    } else if let Some((at, header)) = &header {
+        let (at, line) = first_line(&lines, at + 1, Some(&coordinates(&header.names)))
             .ok_or("its header names the coordinates, but no line with numbers in these columns follows")?;
-        (at, line, header.names.clone(), "header line")
+        // The last columns of the first line may be empty; what is not named at the end may be missing anywhere.
+        let there = line.words(lines[at].trim_ascii()).count();
+        (at, Line { columns: there.min(header.names.len()), ..line }, header.names.clone(), "header line")
     } else {
         let (at, line) = first_line(&lines, 0, None).ok_or(NO_NUMBERS)?;
-        (at, line, Vec::new(), "values")
+        let sample = lines[at..].iter().filter(|l| !is_void(l)).take(1000);
+        let rows = sample.map(|l| line.words(l.trim_ascii()).map(|w| line.number(w)).collect());
+        (at, line, guess(&rows.collect::<Vec<_>>(), line.columns), "values")
     };
-    let rows: Vec<Vec<Option<f64>>> = lines[first_data..]
-        .iter()
-        .filter(|l| !is_void(l))
-        .take(1000)
-        .map(|l| line.words(l.trim_ascii()).map(|w| line.number(w)).collect())
-        .collect();
-    let names = if origin == "values" { guess(&rows, line.columns) } else { names };
-    if origin == "header line" {
-        // What is not named at the end of a line may be missing there.
-        line.columns = line.columns.min(names.len());
-    }
-    let mut names = names;
     names.resize(line.columns, String::new());
     let before = &lines[..first_data];
     let promised = before.iter().find(|l| !is_void(l)).and_then(|l| count_of(l));
-    let is_header = |at: usize| wanted.is_none() && header.as_ref().is_some_and(|h| h.at == at);
-    let skipped: Vec<&[u8]> = (0..first_data)
-        .filter(|&i| {
-            !is_void(lines[i]) && !is_header(i) && header_of(i, lines[i]).is_none() && count_of(lines[i]).is_none()
-        })
-        .map(|i| lines[i])
-        .collect();
+    let is_known = |l: &[u8]| is_void(l) || header_of(l).is_some() || count_of(l).is_some();
+    let skipped: Vec<&[u8]> = before.iter().copied().filter(|l| !is_known(l)).collect();
     Ok(Layout {
         decimal_comma: line.decimal_comma && lines[first_data..].iter().take(1000).any(|l| l.contains(&b',')),
         line,
@@ -90,7 +76,7 @@ pub(super) fn detect(head: &[u8], wanted: Option<&[String]>) -> Result<Layout, S
         header_bytes: before.iter().map(|l| l.len() as u64).sum(),
         origin,
         promised,
-        degrees: origin == "header line" && header.is_some_and(|h| h.degrees),
+        degrees: origin == "header line" && header.is_some_and(|(_, h)| h.degrees),
         skipped: skipped.first().map(|l| (skipped.len(), super::lines::shorten(l.trim_ascii()))),
     })
 }
@@ -130,11 +116,12 @@ fn numeric(line: &Line, text: &[u8], needed: Option<&[usize]>) -> bool {
 }
 
 /// What a line such as `//X Y Z R G B` or `x;y;z;Intensity` says, if it names all coordinates.
-fn header_of(at: usize, text: &[u8]) -> Option<Header> {
+fn header_of(text: &[u8]) -> Option<Header> {
     let text = text.trim_ascii();
     let text = text.strip_prefix(b"//").or_else(|| text.strip_prefix(b"#")).unwrap_or(text);
     separations(text).find_map(|line| {
-        let mut names: Vec<String> = line.words(text).map(|w| canonical(&String::from_utf8_lossy(w))).collect();
+        let words = line.words(text).take(line.columns);
+        let mut names: Vec<String> = words.map(|w| canonical(&String::from_utf8_lossy(w))).collect();
         let place = |wanted: &str| names.iter().position(|n| n == wanted);
         let degrees = match (place("x"), place("y"), place("z")) {
             (Some(_), Some(_), Some(_)) => false,
@@ -147,7 +134,7 @@ fn header_of(at: usize, text: &[u8]) -> Option<Header> {
             }
             _ => return None,
         };
-        Some(Header { at, names, degrees })
+        Some(Header { names, degrees })
     })
 }
 
