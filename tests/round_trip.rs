@@ -20,6 +20,9 @@ fn python() -> Result<String, String> {
     }
 }
 
+/// What the script ends with when laspy does not read the source.
+const LASPY_GIVES_UP: i32 = 3;
+
 /// All records with the columns that a run appends.
 fn rewrite(cloud: &Cloud, to: &Path) {
     let n = cloud.len();
@@ -77,6 +80,10 @@ fn laspy_finds_every_record_header_and_vlr_again() {
             let copy = folder.path().join(format!("copy.{extension}"));
             rewrite(&cloud, &copy);
             let done = Command::new(&python).arg(&script).args([&file, &copy]).output().unwrap();
+            if done.status.code() == Some(LASPY_GIVES_UP) {
+                eprintln!("not compared: {}: {}", file.display(), String::from_utf8_lossy(&done.stdout).trim());
+                break;
+            }
             compared += 1;
             if !done.status.success() {
                 let said = String::from_utf8_lossy(if done.stdout.is_empty() { &done.stderr } else { &done.stdout });

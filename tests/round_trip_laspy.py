@@ -4,8 +4,11 @@
 
 Every dimension of the source must be in the copy with the same bits and in the same order; version, format, scale,
 offset, identifiers, dates and variable length records too. What may differ is what Adit says it changes: the four columns
-that it appends, LASzip's own record, the spatial index of COPC.
+that it appends, LASzip's own record, the spatial index of COPC. Ends with 1 when something differs, with 3 when laspy does
+not read the source (it takes all memory for some broken headers, so memory and time are bounded).
 """
+import resource
+import signal
 import sys
 import laspy
 import numpy as np
@@ -18,8 +21,21 @@ def records(found):
             if r.user_id not in ('laszip encoded', 'copc') and (r.user_id, r.record_id) != ('LASF_Spec', 4)]
 
 
+def read_source(path):
+    resource.setrlimit(resource.RLIMIT_AS, (4 << 30, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    signal.signal(signal.SIGALRM, lambda *_: sys.exit(3))
+    signal.alarm(20)
+    try:
+        source = laspy.read(path)
+    except BaseException as error:  # Panics of lazrs are no Exceptions.
+        print(f'laspy does not read it: {type(error).__name__}')
+        sys.exit(3)
+    signal.alarm(0)
+    return source
+
+
 def main():
-    source, copy = (laspy.read(p) for p in sys.argv[1:3])
+    source, copy = read_source(sys.argv[1]), laspy.read(sys.argv[2])
     a, b = source.header, copy.header
     wrong = []
     for name in ('version', 'uuid', 'creation_date', 'system_identifier', 'generating_software', 'file_source_id', 'point_count'):

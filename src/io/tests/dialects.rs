@@ -32,6 +32,9 @@ fn columns_of_words_stand_beside_the_coordinates() {
     let (cloud, summary) = scan("a.csv", b"code,x,y,z,surveyed\nwall,1,2,3,2024-01-01 10:00\nfloor,4,5,6,\n");
     assert_eq!(in_scan(&cloud), [Vec3::new(1.0, 2.0, 3.0), Vec3::new(4.0, 5.0, 6.0)]);
     assert!(summary.warnings.iter().all(|w| w.code != "skipped-lines"), "{:?}", summary.warnings);
+    // A value that is missing in the first line is no missing column.
+    let (cloud, _) = scan("a.csv", b"x,y,z,intensity,\n1,2,3,,\n4,5,6,7,\n");
+    assert_eq!(cloud.attributes().intensities.as_deref(), Some(&[0, 7][..]));
     let error =
         read_bytes("a.csv", b"code,x,y,z\na,1,2,3\nb,4,five,6\n", &Settings::default()).unwrap_err().to_string();
     assert!(error.contains("line 3: 'five' is not a number"), "{error}");
