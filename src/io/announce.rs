@@ -80,7 +80,9 @@ pub fn announce_part(path: &Path, part: Option<&Part>) -> Result<Announcement, E
             Format::Obj | Format::Off => estimated(bytes / TEXT_BYTES_PER_VERTEX),
             Format::Ptx | Format::Pts | Format::Xyz => {
                 let sample = source.up_to(0, SAMPLE)?;
-                let lines = sample.iter().filter(|&&b| b == b'\n').count().max(1) as u64;
+                let ends = |end: u8| sample.iter().filter(|&&b| b == end).count();
+                // Old exports end their lines with a carriage return alone.
+                let lines = ends(b'\n').max(ends(b'\r')).max(1) as u64;
                 estimated((bytes as f64 * lines as f64 / sample.len() as f64).round() as u64)
             }
         })
@@ -149,8 +151,10 @@ mod tests {
     fn lines_of_text_are_estimated() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("a.xyz");
-        fs::write(&path, "1.000 2.000 3.000\n".repeat(10_000)).unwrap();
-        let told = announce(&path).unwrap();
-        assert!(!told.counted && told.points.abs_diff(10_000) < 100, "{told:?}");
+        for end in ["\n", "\r\n", "\r"] {
+            fs::write(&path, format!("1.000 2.000 3.000{end}").repeat(10_000)).unwrap();
+            let told = announce(&path).unwrap();
+            assert!(!told.counted && told.points.abs_diff(10_000) < 100, "{told:?}");
+        }
     }
 }
