@@ -72,10 +72,15 @@ fn laspy_finds_every_record_header_and_vlr_again() {
     let (mut failures, mut compared) = (Vec::new(), 0);
     for file in files {
         // Files without points make no cloud; that they are refused is tested elsewhere.
-        let Ok((cloud, _)) = io::read_cloud(std::slice::from_ref(&file), &settings) else {
+        let Ok((cloud, summary)) = io::read_cloud(std::slice::from_ref(&file), &settings) else {
             eprintln!("not read: {}", file.display());
             continue;
         };
+        // What a header promises beyond the records that are there is not written again, and that is said.
+        if summary.warnings.iter().any(|w| w.code == "las-variable-length-records") {
+            eprintln!("not compared, its header promises too much: {}", file.display());
+            continue;
+        }
         for extension in ["las", "laz"] {
             let copy = folder.path().join(format!("copy.{extension}"));
             rewrite(&cloud, &copy);
