@@ -1,7 +1,7 @@
 //! Read, write, and let an independent reader compare: laspy, where a Python with it is present.
 //!
 //! `ADIT_TEST_PYTHON` names the Python (default `python3`); `ADIT_ROUND_TRIP_FOLDER` adds all LAS and LAZ files of a
-//! folder to those that are made here.
+//! folder and of the folders in it to those that are made here.
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
 
@@ -20,6 +20,9 @@ fn python() -> Result<String, String> {
     }
 }
 
+/// What the script ends with when laspy does not read the source.
+const LASPY_GIVES_UP: i32 = 3;
+
 /// All records with the columns that a run appends.
 fn rewrite(cloud: &Cloud, to: &Path) {
     let n = cloud.len();
@@ -32,11 +35,15 @@ fn rewrite(cloud: &Cloud, to: &Path) {
 }
 
 fn las_files(folder: &Path) -> Vec<PathBuf> {
-    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|p| p.extension().is_some_and(|e| e == "las" || e == "laz"))
-        .collect();
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(las_files(&path));
+        } else if path.extension().is_some_and(|e| e == "las" || e == "laz") {
+            files.push(path);
+        }
+    }
     files.sort();
     files
 }
@@ -65,14 +72,23 @@ fn laspy_finds_every_record_header_and_vlr_again() {
     let (mut failures, mut compared) = (Vec::new(), 0);
     for file in files {
         // Files without points make no cloud; that they are refused is tested elsewhere.
-        let Ok((cloud, _)) = io::read_cloud(std::slice::from_ref(&file), &settings) else {
+        let Ok((cloud, summary)) = io::read_cloud(std::slice::from_ref(&file), &settings) else {
             eprintln!("not read: {}", file.display());
             continue;
         };
+        // What a header promises beyond the records that are there is not written again, and that is said.
+        if summary.warnings.iter().any(|w| w.code == "las-variable-length-records") {
+            eprintln!("not compared, its header promises too much: {}", file.display());
+            continue;
+        }
         for extension in ["las", "laz"] {
             let copy = folder.path().join(format!("copy.{extension}"));
             rewrite(&cloud, &copy);
             let done = Command::new(&python).arg(&script).args([&file, &copy]).output().unwrap();
+            if done.status.code() == Some(LASPY_GIVES_UP) {
+                eprintln!("not compared: {}: {}", file.display(), String::from_utf8_lossy(&done.stdout).trim());
+                break;
+            }
             compared += 1;
             if !done.status.success() {
                 let said = String::from_utf8_lossy(if done.stdout.is_empty() { &done.stderr } else { &done.stdout });

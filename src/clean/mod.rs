@@ -231,7 +231,7 @@ mod tests {
             first_point: 0,
             point_count: n,
             record_count: n as u64,
-            dropped_records: vec![],
+            dropped_records: Default::default(),
         };
         Cloud::new(ScanFrame::local(), positions, Attributes::default(), vec![source], vec![]).unwrap()
     }

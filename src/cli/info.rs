@@ -112,8 +112,8 @@ fn describe(info: &ScanInfo) -> String {
     line("labels", info.label_column.clone().unwrap_or_default());
     line("crs", info.crs.clone().unwrap_or_default());
     for station in &info.stations {
-        let [x, y, z] = station.position;
-        line("station", format!("{} at {x:.3}, {y:.3}, {z:.3}", station.name));
+        let place = station.position.map(|[x, y, z]| format!(" at {x:.3}, {y:.3}, {z:.3}"));
+        line("station", format!("{}{}", station.name, place.unwrap_or_default()));
     }
     for (key, value) in &info.header {
         line(key, value.to_string());

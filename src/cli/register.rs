@@ -2,7 +2,7 @@
 
 use super::run_surface::io_failure;
 use super::{Console, Exit, Failure, Result};
-use crate::io::{self, Pose, StationScan};
+use crate::io::{self, Pose, PoseEntry, StationScan};
 use crate::numeric::Vec3;
 use crate::register::{self, Motion, Overlap, Surface};
 use std::path::{Path, PathBuf};
@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 const EXAMPLES: &str = "\
 Examples:
   adit register station_1.laz station_2.laz station_3.laz --out poses.toml
+  adit register survey.e57 --out poses.toml             all scans in one file
   adit run --input station_1.laz --input station_2.laz --set ingest.poses=\\\"poses.toml\\\" --out runs/drift
 
 Nothing is moved by this command: it writes poses, and a run uses them only when ingest.poses names the file.
@@ -19,8 +20,8 @@ The first scan stays where it is. Each of the others is brought to all those bef
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Arguments {
-    /// The scans, one file a station; the first one stays.
-    #[arg(value_name = "FILE", required = true, num_args = 2..)]
+    /// The scans: a file is a station, or each scan in it (E57, PTX) is one; the first one stays.
+    #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
     /// Where the poses go (TOML, for ingest.poses).
     #[arg(long, value_name = "POSES.toml")]
@@ -41,15 +42,17 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let settings = io::Settings { poses: arguments.poses.clone(), ..Default::default() };
     let mut stations = Vec::new();
     for file in &arguments.files {
-        stations.push(io::read_station(file, &settings).map_err(io_failure)?);
+        stations.extend(io::read_stations(file, &settings).map_err(io_failure)?);
+    }
+    if stations.len() < 2 {
+        let message = format!("{} is the only station; name two files, or one that holds several scans", stations[0]);
+        return Err(Failure::message(Exit::Usage, message));
     }
     let unit = stations[0].metres_per_unit;
     if let Some(other) = stations.iter().find(|s| s.metres_per_unit != unit) {
         let message = format!(
-            "'{}' has units of {} m, '{}' of {unit} m: convert them to one unit first",
-            other.path.display(),
-            other.metres_per_unit,
-            stations[0].path.display()
+            "{other} has units of {} m, {} of {unit} m: convert them to one unit first",
+            other.metres_per_unit, stations[0]
         );
         return Err(Failure::message(Exit::BadInput, message));
     }
@@ -57,12 +60,17 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
     let origin = stations[0].points_in_scan.first().map_or_else(Vec3::zeros, |p| p.map(f64::floor));
     let local = |s: &StationScan| s.points_in_scan.iter().map(|p| (p - origin) * unit).collect::<Vec<Vec3>>();
     let mut fixed = local(&stations[0]);
-    let mut scans = vec![(stations[0].path.clone(), stations[0].pose, "the first scan stays".to_owned())];
+    let entry = |station: &StationScan, pose: Pose, remark: String| PoseEntry {
+        file: station.path.clone(),
+        station: station.station,
+        pose,
+        remark,
+    };
+    let mut entries = vec![entry(&stations[0], stations[0].pose, "the first scan stays".to_owned())];
     for station in &stations[1..] {
         let moving = local(station);
-        let found = register::align(&Surface::new(&fixed), &moving, arguments.distance).map_err(|error| {
-            Failure::message(Exit::BadInput, format!("'{}' cannot be registered: {error}", station.path.display()))
-        })?;
+        let found = register::align(&Surface::new(&fixed), &moving, arguments.distance)
+            .map_err(|error| Failure::message(Exit::BadInput, format!("{station} cannot be registered: {error}")))?;
         let turn = nalgebra::Rotation3::from_matrix_unchecked(found.motion.rotation).angle().to_degrees();
         let remark = format!(
             "moved by {:.1} mm and turned by {turn:.4} degrees in {} iterations\nbefore: {}\nafter: {}",
@@ -71,20 +79,23 @@ pub fn run(arguments: Arguments, console: &Console) -> Result {
             in_words(&found.before),
             in_words(&found.after)
         );
-        console.print(&format!("{}\n  {}", station.path.display(), remark.replace('\n', "\n  ")));
+        console.print(&format!("{station}\n  {}", remark.replace('\n', "\n  ")));
         if found.after.median_m > found.before.median_m {
-            console.warn(&format!("'{}' agrees no better than before", station.path.display()));
+            console.warn(&format!("{station} agrees no better than before"));
         }
         fixed.extend(moving.iter().map(|p| found.motion.apply(p)));
-        scans.push((station.path.clone(), moved(&station.pose, &found.motion, &origin, unit), remark));
+        entries.push(entry(station, moved(&station.pose, &found.motion, &origin, unit), remark));
     }
     // Names are enough for ingest.poses where they differ, and survive a move of the folder.
-    let names: Vec<PathBuf> = scans.iter().filter_map(|s| s.0.file_name().map(PathBuf::from)).collect();
+    let names: Vec<PathBuf> = arguments.files.iter().filter_map(|f| f.file_name().map(PathBuf::from)).collect();
     let unique = names.iter().enumerate().all(|(i, name)| !names[..i].contains(name));
-    for ((file, ..), name) in scans.iter_mut().zip(names) {
-        *file = if unique { name } else { std::path::absolute(&file).map_err(|e| Failure::new(Exit::BadInput, e))? };
+    for entry in &mut entries {
+        entry.file = match entry.file.file_name().filter(|_| unique) {
+            Some(name) => PathBuf::from(name),
+            None => std::path::absolute(&entry.file).map_err(|e| Failure::new(Exit::BadInput, e))?,
+        };
     }
-    io::write_poses(&arguments.out, &scans).map_err(io_failure)?;
+    io::write_poses(&arguments.out, &entries).map_err(io_failure)?;
     console.say(&format!("wrote {}; use it with ingest.poses = \"{0}\"", display(&arguments.out)));
     Ok(Exit::Done)
 }

@@ -1,7 +1,9 @@
 //! A scan in memory: equal columns of attributes over points in metres, in a [`ScanFrame`].
 
+mod dropped_records;
 mod scan_frame;
 
+pub use dropped_records::DroppedRecords;
 pub use scan_frame::ScanFrame;
 
 use crate::numeric::Vec3;
@@ -21,31 +23,24 @@ pub struct SourceFile {
     pub point_count: usize,
     /// How many records the file holds, dropped ones included.
     pub record_count: u64,
-    /// Record numbers (zero-based, ascending) that were dropped while reading, e.g. because a coordinate was NaN.
-    pub dropped_records: Vec<u64>,
+    /// Records that gave no point, e.g. because a coordinate was NaN or they lie outside the part that was read.
+    pub dropped_records: DroppedRecords,
 }
 
 impl SourceFile {
     /// Zero-based record number in the file of the cloud's point `index`, which must lie in this file's range.
     pub fn record_of(&self, index: usize) -> u64 {
-        let mut record = (index - self.first_point) as u64;
-        for &dropped in &self.dropped_records {
-            if dropped > record {
-                break;
-            }
-            record += 1;
-        }
-        record
+        self.dropped_records.record_of((index - self.first_point) as u64)
     }
 }
 
-/// A scanner position known from the file (E57 or PTX pose).
+/// A scan of one scanner setup that a file tells apart from others (E57, PTX, PCD).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Station {
     /// Name from the file, or a generated one.
     pub name: String,
-    /// Position of the scanner in local metres.
-    pub position_in_local: Vec3,
+    /// Position of the scanner in local metres, if the file tells it.
+    pub position_in_local: Option<Vec3>,
 }
 
 /// The optional attribute columns; each is as long as the cloud when present.
@@ -63,6 +58,22 @@ pub struct Attributes {
     pub labels: Option<Vec<Label>>,
     /// Index into [`Cloud::stations`] of the scanner that saw the point.
     pub station_ids: Option<Vec<u16>>,
+}
+
+impl Attributes {
+    /// Keeps the rows for which `keep` is true; it has one entry for each.
+    pub fn retain(&mut self, keep: &[bool]) {
+        fn filter<T>(column: &mut Option<Vec<T>>, keep: &[bool]) {
+            let mut kept = keep.iter();
+            column.iter_mut().for_each(|c| c.retain(|_| *kept.next().expect("one entry for each row")));
+        }
+        filter(&mut self.colors, keep);
+        filter(&mut self.intensities, keep);
+        filter(&mut self.classifications, keep);
+        filter(&mut self.source_ids, keep);
+        filter(&mut self.labels, keep);
+        filter(&mut self.station_ids, keep);
+    }
 }
 
 /// Points in metres relative to a [`ScanFrame`], with attributes and provenance.
@@ -195,7 +206,7 @@ mod tests {
             first_point: 0,
             point_count: n,
             record_count: n as u64,
-            dropped_records: vec![],
+            dropped_records: DroppedRecords::default(),
         }
     }
 
@@ -217,7 +228,7 @@ mod tests {
     fn record_numbers_skip_dropped_records() {
         let mut s = source(4);
         s.first_point = 10;
-        s.dropped_records = vec![0, 2, 3];
+        s.dropped_records = [0, 2, 3].into_iter().collect();
         // Records 0..7 without 0, 2, 3 are 1, 4, 5, 6.
         assert_eq!((10..14).map(|i| s.record_of(i)).collect::<Vec<_>>(), [1, 4, 5, 6]);
     }

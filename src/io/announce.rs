@@ -4,6 +4,7 @@
 use super::assemble::contained;
 use super::detect::{self, Format};
 use super::error::{COPY_AGAIN, Error};
+use super::part::Part;
 use super::source_bytes::SourceBytes;
 use super::{e57, las, pcd, ply};
 use serde::Serialize;
@@ -39,6 +40,14 @@ const STL_HEADER: u64 = 84;
 /// # Errors
 /// [`Error`] when the file cannot be opened, its header does not read, or the file is shorter than its header says.
 pub fn announce(path: &Path) -> Result<Announcement, Error> {
+    announce_part(path, None)
+}
+
+/// As [`announce`]; of a COPC only the points that may lie in `part` are counted. Other formats tell nothing about parts.
+///
+/// # Errors
+/// As [`announce`].
+pub fn announce_part(path: &Path, part: Option<&Part>) -> Result<Announcement, Error> {
     contained(path, || {
         let source = SourceBytes::open(path)?;
         let bytes = source.len();
@@ -46,7 +55,7 @@ pub fn announce(path: &Path) -> Result<Announcement, Error> {
         let estimated = |points| Announcement { points, counted: false, bytes, bounds_m: None };
         Ok(match detect::format_of(&source)? {
             Format::Las => {
-                let (points, bounds_m) = las::announced_points(&source)?;
+                let (points, bounds_m) = las::announced_points(&source, part)?;
                 Announcement { bounds_m, ..counted(points) }
             }
             Format::E57 => counted(e57::announced_points(&source)?),
@@ -71,7 +80,9 @@ pub fn announce(path: &Path) -> Result<Announcement, Error> {
             Format::Obj | Format::Off => estimated(bytes / TEXT_BYTES_PER_VERTEX),
             Format::Ptx | Format::Pts | Format::Xyz => {
                 let sample = source.up_to(0, SAMPLE)?;
-                let lines = sample.iter().filter(|&&b| b == b'\n').count().max(1) as u64;
+                let ends = |end: u8| sample.iter().filter(|&&b| b == end).count();
+                // Old exports end their lines with a carriage return alone.
+                let lines = ends(b'\n').max(ends(b'\r')).max(1) as u64;
                 estimated((bytes as f64 * lines as f64 / sample.len() as f64).round() as u64)
             }
         })
@@ -101,7 +112,7 @@ mod tests {
             first_point: 0,
             point_count: points,
             record_count: points as u64,
-            dropped_records: Vec::new(),
+            dropped_records: Default::default(),
         }];
         Cloud::new(ScanFrame::local(), positions, Attributes::default(), sources, Vec::new()).unwrap()
     }
@@ -140,8 +151,10 @@ mod tests {
     fn lines_of_text_are_estimated() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("a.xyz");
-        fs::write(&path, "1.000 2.000 3.000\n".repeat(10_000)).unwrap();
-        let told = announce(&path).unwrap();
-        assert!(!told.counted && told.points.abs_diff(10_000) < 100, "{told:?}");
+        for end in ["\n", "\r\n", "\r"] {
+            fs::write(&path, format!("1.000 2.000 3.000{end}").repeat(10_000)).unwrap();
+            let told = announce(&path).unwrap();
+            assert!(!told.counted && told.points.abs_diff(10_000) < 100, "{told:?}");
+        }
     }
 }

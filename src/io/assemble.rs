@@ -2,13 +2,14 @@
 
 use super::detect::{self, Format};
 use super::error::Error;
-use super::file_scan::{FileScan, Settings};
+use super::file_scan::{FileInfo, FileScan, Settings};
 use super::guards::{self, PointGuards};
+use super::part::Part;
 use super::poses::Poses;
 use super::source_bytes::SourceBytes;
 use super::stations::{self, StationOverlap};
 use super::{e57, las, pcd, ply, text, unit_guess};
-use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile, Station};
+use crate::cloud::{Attributes, Cloud, DroppedRecords, ScanFrame, SourceFile, Station};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
 use serde::Serialize;
@@ -57,7 +58,10 @@ pub struct FileSummary {
     /// Points read from it.
     pub points: usize,
     /// Records that gave no point (not a number, or no echo).
-    pub dropped: usize,
+    pub dropped: u64,
+    /// Records outside the part of the scan that was asked for.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub outside_part: u64,
     /// Column that labels came from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub label_column: Option<String>,
@@ -74,23 +78,36 @@ pub struct FileSummary {
 /// [`Error`] names the first file that cannot be used, why, and what to do: missing, empty, truncated or contradictory
 /// files, coordinates in degrees, files with different coordinate reference systems, no points at all.
 pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summary), Error> {
+    read_part(files, settings, None)
+}
+
+/// As [`read_cloud`], but only the points of a part of the scan; what lies outside is counted.
+///
+/// # Errors
+/// As [`read_cloud`]; also when the scan is in another unit than the part, or nothing of it lies in the part.
+pub fn read_part(files: &[PathBuf], settings: &Settings, part: Option<&Part>) -> Result<(Cloud, Summary), Error> {
     let mut whole: Option<Whole> = None;
     let mut warnings = Vec::new();
     let poses = settings.poses.as_deref().map(Poses::read).transpose()?.unwrap_or_default();
     for path in files {
         let origin = whole.as_ref().map(|w| w.scan.origin);
-        let mut scan = match poses.of(path) {
-            None => {
-                if let Some(poses) = &settings.poses {
-                    let text =
-                        format!("'{}' names no pose for '{}'; it is left where it is", poses.display(), path.display());
-                    warnings.push(Warning::new("no-pose", text));
-                }
-                read_file(path, settings, origin)?
+        let of_file = poses.of(path);
+        let mut scan = if of_file.is_empty() {
+            if let Some(poses) = &settings.poses {
+                let text =
+                    format!("'{}' names no pose for '{}'; it is left where it is", poses.display(), path.display());
+                warnings.push(Warning::new("no-pose", text));
             }
-            Some(pose) => pose.apply(path, read_file(path, settings, None)?, origin),
+            read_file(path, settings, origin, part)?
+        } else {
+            // Where its points lie is known when they have been moved.
+            of_file.apply(path, read_file(path, settings, None, None)?, origin)?
         };
         refuse_degrees(path, &scan, settings)?;
+        if let Some(part) = part {
+            check_unit(&scan, settings, part)?;
+            scan.keep_part(part);
+        }
         let (guards, mut found, sample) = guards::inspect(&scan);
         found.splice(0..0, std::mem::take(&mut scan.warnings));
         for mut warning in found {
@@ -109,15 +126,20 @@ pub fn read_cloud(files: &[PathBuf], settings: &Settings) -> Result<(Cloud, Summ
         cause: "no scan was named".into(),
         remedy: "name one or several files".into(),
     })?;
-    whole.finish(settings, warnings)
+    whole.finish(settings, part, warnings)
 }
 
-/// Reads one file of any format; a panic in a decoder ends as bad input.
-pub(super) fn read_file(path: &Path, settings: &Settings, origin: Option<Vec3>) -> Result<FileScan, Error> {
+/// Reads one file of any format; a panic in a decoder ends as bad input. With a `part`, points outside it may be missing.
+pub(super) fn read_file(
+    path: &Path,
+    settings: &Settings,
+    origin: Option<Vec3>,
+    part: Option<&Part>,
+) -> Result<FileScan, Error> {
     contained(path, || {
         let source = SourceBytes::open(path)?;
         match detect::format_of(&source)? {
-            Format::Las => las::read(&source, settings, origin),
+            Format::Las => las::read(&source, settings, origin, part),
             Format::Ply => ply::read(&source, settings, origin),
             Format::E57 => e57::read(&source, settings, origin),
             Format::Ptx => text::read_ptx(&source, settings, origin),
@@ -156,6 +178,24 @@ pub(super) fn refuse_degrees(path: &Path, scan: &FileScan, settings: &Settings) 
     ))
 }
 
+/// The part is told in metres of the scan that the settings assume.
+fn check_unit(scan: &FileScan, settings: &Settings, part: &Part) -> Result<(), Error> {
+    let metres = settings.unit.map(super::Unit::metres).or(scan.info.crs.as_ref().and_then(|c| c.metres_per_unit));
+    let metres = metres.unwrap_or(1.0);
+    if (metres - part.metres_per_unit()).abs() < 1e-9 {
+        return Ok(());
+    }
+    Err(Error::Settings {
+        key: "ingest.chainage_m",
+        cause: format!("the scan states a unit of {metres} m, which must be known before a part of it can be read"),
+        remedy: "set ingest.unit".into(),
+    })
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
+}
+
 struct Whole {
     scan: FileScan,
     sources: Vec<SourceFile>,
@@ -164,6 +204,17 @@ struct Whole {
     high: Vec3,
     /// Some points of the first file, scan coordinates.
     sample: Vec<Vec3>,
+}
+
+/// What one file gave.
+struct Row {
+    first_point: usize,
+    points: usize,
+    records: u64,
+    dropped: DroppedRecords,
+    outside_part: u64,
+    info: FileInfo,
+    guards: PointGuards,
 }
 
 impl Whole {
@@ -176,43 +227,42 @@ impl Whole {
             sample,
             scan,
         };
-        let (points, dropped, info) =
-            (whole.scan.positions.len(), std::mem::take(&mut whole.scan.dropped_records), whole.scan.info.clone());
-        whole.note(path, 0, points, whole.scan.record_count, dropped, &info, guards);
+        let scan = &mut whole.scan;
+        let row = Row {
+            first_point: 0,
+            points: scan.positions.len(),
+            records: scan.record_count,
+            dropped: std::mem::take(&mut scan.dropped_records),
+            outside_part: scan.outside_part,
+            info: scan.info.clone(),
+            guards,
+        };
+        whole.note(path, row);
         whole
     }
 
-    #[allow(clippy::too_many_arguments, reason = "one row of a table")]
-    fn note(
-        &mut self,
-        path: &Path,
-        first_point: usize,
-        points: usize,
-        records: u64,
-        dropped: Vec<u64>,
-        info: &super::file_scan::FileInfo,
-        guards: PointGuards,
-    ) {
+    fn note(&mut self, path: &Path, row: Row) {
         self.files.push(FileSummary {
             path: path.to_owned(),
-            format: info.format,
-            version: info.version.clone(),
-            records,
-            points,
-            dropped: dropped.len(),
-            label_column: info.label_column.clone(),
-            guards,
+            format: row.info.format,
+            version: row.info.version,
+            records: row.records,
+            points: row.points,
+            dropped: row.dropped.count() - row.outside_part,
+            outside_part: row.outside_part,
+            label_column: row.info.label_column,
+            guards: row.guards,
         });
-        if let Some([low, high]) = info.bounds {
+        if let Some([low, high]) = row.info.bounds {
             self.low = self.low.inf(&low.into());
             self.high = self.high.sup(&high.into());
         }
         self.sources.push(SourceFile {
             path: path.to_owned(),
-            first_point,
-            point_count: points,
-            record_count: records,
-            dropped_records: dropped,
+            first_point: row.first_point,
+            point_count: row.points,
+            record_count: row.records,
+            dropped_records: row.dropped,
         });
     }
 
@@ -226,7 +276,7 @@ impl Whole {
         check_same_crs(&self.files[0].path, &self.scan, path, &scan, warnings)?;
         let before = self.scan.positions.len();
         let added = scan.positions.len();
-        let FileScan { positions, attributes, stations, record_count, dropped_records, info, .. } = scan;
+        let FileScan { positions, attributes, stations, record_count, dropped_records, outside_part, info, .. } = scan;
         self.scan.positions.extend(positions);
         let first_station = self.scan.stations.len() as u16;
         let mine = &mut self.scan.attributes;
@@ -240,15 +290,27 @@ impl Whole {
         let ids = attributes.station_ids.map(|ids| ids.into_iter().map(|i| i.saturating_add(first_station)).collect());
         context.column("stations", &mut mine.station_ids, ids, u16::MAX, Some("unknown"), warnings);
         self.scan.stations.extend(stations);
-        self.note(path, before, added, record_count, dropped_records, &info, guards);
+        let dropped = dropped_records;
+        let row =
+            Row { first_point: before, points: added, records: record_count, dropped, outside_part, info, guards };
+        self.note(path, row);
         Ok(())
     }
 
-    fn finish(self, settings: &Settings, mut warnings: Vec<Warning>) -> Result<(Cloud, Summary), Error> {
+    fn finish(
+        self,
+        settings: &Settings,
+        part: Option<&Part>,
+        mut warnings: Vec<Warning>,
+    ) -> Result<(Cloud, Summary), Error> {
         let Self { mut scan, sources, files, low, high, sample } = self;
         let path = &files[0].path;
         if scan.positions.is_empty() {
-            let dropped: usize = files.iter().map(|f| f.dropped).sum();
+            let dropped: u64 = files.iter().map(|f| f.dropped).sum();
+            if let Some(part) = part.filter(|_| files.iter().any(|f| f.outside_part > 0)) {
+                let cause = format!("none of its points lies {}", part.in_words());
+                return Err(Error::bad(path, cause, "set ingest.chainage_m to where the scan lies, or leave it out"));
+            }
             let cause = if dropped > 0 {
                 format!("none of its {dropped} records is a point")
             } else {
@@ -259,7 +321,7 @@ impl Whole {
         let metres_per_unit = unit_of(&scan, settings, &mut warnings);
         if metres_per_unit != 1.0 {
             scan.positions.iter_mut().for_each(|p| *p *= metres_per_unit);
-            scan.stations.iter_mut().for_each(|s| s.position_in_local *= metres_per_unit);
+            scan.stations.iter_mut().filter_map(|s| s.position_in_local.as_mut()).for_each(|p| *p *= metres_per_unit);
         } else if settings.unit.is_none() {
             warnings.extend(unit_guess::of(&(high - low), &sample));
         }
@@ -274,7 +336,7 @@ impl Whole {
             origin_in_scan: scan.origin.into(),
             bounds_in_scan: [low.into(), high.into()],
             crs,
-            stations: known.len(),
+            stations: known.iter().filter(|s| s.position_in_local.is_some()).count(),
             overlaps: Vec::new(),
             files,
             warnings,

@@ -25,6 +25,11 @@ impl Format {
     pub(super) fn is_mesh(self) -> bool {
         matches!(self, Self::Obj | Self::Off | Self::Stl | Self::Glb)
     }
+
+    /// Whether one file may hold the scans of several stations.
+    pub(super) fn may_hold_stations(self) -> bool {
+        matches!(self, Self::E57 | Self::Ptx)
+    }
 }
 
 /// Lower-case extension of a path.

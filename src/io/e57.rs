@@ -14,7 +14,7 @@ use super::source_bytes::SourceBytes;
 use crate::cloud::Station;
 use crate::numeric::Vec3;
 use crate::warning::Warning;
-use ::e57::{CartesianCoordinate, E57Reader, PointCloud, RecordDataType};
+use ::e57::{CartesianCoordinate, E57Reader, Point, PointCloud, RecordDataType, RecordName};
 use std::fs::File;
 use std::io::BufReader;
 
@@ -56,43 +56,31 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
         // One slot: rows are filled in order.
         let mut slots = table.slots((total as usize).max(1));
         for (index, cloud) in clouds.iter().enumerate() {
-            let station = cloud.transform.as_ref().map_or(u16::MAX, |pose| {
-                let t = &pose.translation;
-                stations.push(Station {
-                    name: cloud.name.clone().unwrap_or_else(|| format!("scan {}", index + 1)),
-                    position_in_local: Vec3::new(t.x, t.y, t.z),
-                });
-                (stations.len() - 1) as u16
-            });
+            // A scan without a pose was moved to where it belongs already: nobody knows from where it was seen.
+            let place = cloud.transform.as_ref().map(|pose| &pose.translation).map(|t| Vec3::new(t.x, t.y, t.z));
+            let place = place.filter(|p| p.iter().all(|c| c.is_finite()));
+            let mut station = u16::MAX;
+            if place.is_some() || clouds.len() > 1 {
+                station = stations.len().min(usize::from(u16::MAX)) as u16;
+                let name = cloud.name.clone().unwrap_or_else(|| format!("scan {}", index + 1));
+                stations.push(Station { name, position_in_local: place });
+            }
             check_pose(index, cloud, &mut warnings);
-            let mut points = reader.pointcloud_simple(cloud).map_err(bad)?;
-            points.apply_pose(true);
-            points.spherical_to_cartesian(true);
-            points.intensity_to_color(false);
-            // Every packet has at least four bytes.
-            let mut empty_packets = source.len() / 4;
-            for point in points {
-                // A packet may complete no point; the decoder calls that an internal error and goes on when asked again.
-                if matches!(point, Err(::e57::Error::Internal { .. })) && empty_packets > 0 {
-                    empty_packets -= 1;
-                    continue;
-                }
-                let point = point.map_err(|e| {
-                    let cause = format!("scan {index} breaks at one of its {} records: {e}", cloud.records);
-                    Error::bad(path, cause, COPY_AGAIN)
-                })?;
+            let own = OwnRange::of(&mut reader, source, index, cloud)?;
+            warnings.extend(own.told(index));
+            each_point(&mut reader, source, index, cloud, &own, |point| {
                 let mut values = [f64::NAN; 7];
                 if let CartesianCoordinate::Valid { x, y, z } = point.cartesian {
                     (values[0], values[1], values[2]) = (x, y, z);
                 }
                 // What has no valid colour or intensity shows as black.
-                let color = point.color.map_or([0.0; 3], |c| [c.red, c.green, c.blue]);
-                (values[3], values[4], values[5]) = (color[0].into(), color[1].into(), color[2].into());
-                values[6] = point.intensity.unwrap_or(0.0).into();
+                let color = point.color.map_or([0.0; 3], |c| [c.red, c.green, c.blue].map(|c| own.color(c)));
+                values[3..6].copy_from_slice(&color);
+                values[6] = point.intensity.map_or(0.0, |i| own.intensity(i));
                 slots[0].set(row, &roles, &mut 0, |column| values[column]);
                 station_of_record.push(station);
                 row += 1;
-            }
+            })?;
         }
     }
     if row as u64 != total {
@@ -106,6 +94,123 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
         scan.set_stations(stations, station_of_record);
     }
     Ok(scan.relative(origin))
+}
+
+/// Visits all points of a scan in common coordinates.
+fn each_point(
+    reader: &mut E57Reader<BufReader<File>>,
+    source: &SourceBytes,
+    index: usize,
+    cloud: &PointCloud,
+    own: &OwnRange,
+    mut visit: impl FnMut(Point),
+) -> Result<(), Error> {
+    let path = source.path();
+    let mut points = reader.pointcloud_simple(cloud).map_err(|e| Error::bad(path, e.to_string(), COPY_AGAIN))?;
+    points.apply_pose(true);
+    points.spherical_to_cartesian(true);
+    points.intensity_to_color(false);
+    points.normalize_intensity(own.intensity.is_none());
+    points.normalize_color(own.color.is_none());
+    // Every packet has at least four bytes.
+    let mut empty_packets = source.len() / 4;
+    for point in points {
+        // A packet may complete no point; the decoder calls that an internal error and goes on when asked again.
+        if matches!(point, Err(::e57::Error::Internal { .. })) && empty_packets > 0 {
+            empty_packets -= 1;
+            continue;
+        }
+        visit(point.map_err(|e| {
+            let cause = format!("scan {index} breaks at one of its {} records: {e}", cloud.records);
+            Error::bad(path, cause, COPY_AGAIN)
+        })?);
+    }
+    Ok(())
+}
+
+/// Ranges of a scan's own values, where neither limits nor types state any: the standard lets floating point numbers
+/// go without.
+#[derive(Clone, Copy, Debug, Default)]
+struct OwnRange {
+    intensity: Option<[f32; 2]>,
+    /// The largest channel.
+    color: Option<f32>,
+}
+
+impl OwnRange {
+    fn of(
+        reader: &mut E57Reader<BufReader<File>>,
+        source: &SourceBytes,
+        index: usize,
+        cloud: &PointCloud,
+    ) -> Result<Self, Error> {
+        let boundless = |name: &RecordName| {
+            let data_type = cloud.prototype.iter().find(|r| r.name == *name).map(|r| &r.data_type);
+            match data_type {
+                Some(RecordDataType::Single { min, max }) => min.is_none() || max.is_none(),
+                Some(RecordDataType::Double { min, max }) => min.is_none() || max.is_none(),
+                _ => false,
+            }
+        };
+        let gray = cloud.intensity_limits.as_ref();
+        let gray_limited = gray.is_some_and(|l| l.intensity_min.is_some() && l.intensity_max.is_some());
+        let color_limited = cloud.color_limits.as_ref().is_some_and(|l| {
+            let all = [&l.red_min, &l.red_max, &l.green_min, &l.green_max, &l.blue_min, &l.blue_max];
+            all.into_iter().all(Option::is_some)
+        });
+        let mut own = Self::default();
+        if !gray_limited && boundless(&RecordName::Intensity) {
+            own.intensity = Some([f32::INFINITY, f32::NEG_INFINITY]);
+        }
+        let channels = [RecordName::ColorRed, RecordName::ColorGreen, RecordName::ColorBlue];
+        if !color_limited && channels.iter().any(boundless) {
+            own.color = Some(0.0);
+        }
+        let mut seen = own;
+        if own.intensity.is_some() || own.color.is_some() {
+            each_point(reader, source, index, cloud, &own, |point| {
+                if let (Some([low, high]), Some(i)) = (&mut seen.intensity, point.intensity.filter(|i| i.is_finite())) {
+                    (*low, *high) = (low.min(i), high.max(i));
+                }
+                if let (Some(most), Some(c)) = (&mut seen.color, point.color) {
+                    *most = [c.red, c.green, c.blue].into_iter().filter(|c| c.is_finite()).fold(*most, f32::max);
+                }
+            })?;
+        }
+        Ok(seen)
+    }
+
+    /// An intensity as a share of its range; that of 0 to 1 is kept.
+    fn intensity(&self, value: f32) -> f64 {
+        let value = f64::from(value);
+        match self.intensity.map(|range| range.map(f64::from)) {
+            Some([low, high]) if low < 0.0 || high > 1.0 => {
+                if high > low {
+                    (value - low) / (high - low)
+                } else {
+                    1.0
+                }
+            }
+            _ => value,
+        }
+    }
+
+    /// A colour channel as a share of 1, of 255 or of 65535, whichever holds the largest one.
+    fn color(&self, value: f32) -> f64 {
+        let most = match self.color {
+            Some(most) if most > 255.0 => 65_535.0,
+            Some(most) if most > 1.0 => 255.0,
+            _ => 1.0,
+        };
+        f64::from(value) / most
+    }
+
+    fn told(&self, index: usize) -> Option<Warning> {
+        let [low, high] = self.intensity.filter(|[low, high]| *low < 0.0 || *high > 1.0)?;
+        let text =
+            format!("scan {index} states no limits of its intensities; {low} to {high} are stretched to 0..65535");
+        Some(Warning::new("intensity-range", text))
+    }
 }
 
 /// How many points all scans of the file hold, from its header and its XML; the file must have its stated length.

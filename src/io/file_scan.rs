@@ -1,8 +1,10 @@
 //! What one file gives: columns, provenance, and what is known about the file.
 
-use crate::cloud::{Attributes, Station};
+use super::part::Part;
+use crate::cloud::{Attributes, DroppedRecords, Station};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -21,6 +23,9 @@ pub struct Settings {
     pub text_columns: Option<Vec<String>>,
     /// TOML file with a 4x4 matrix `pose` for each input file, see `docs/formats.md`. Not set: only poses in the files.
     pub poses: Option<PathBuf>,
+    /// Only the part of the scan between two chainages of `axis.alignment`, metres, as far as 30 m from it. Of COPC files only
+    /// what may lie there is read, of others everything is looked at. Not set: the whole scan.
+    pub chainage_m: Option<[f64; 2]>,
     /// Use the complete records of a file that was cut off, with a warning, instead of refusing it.
     pub allow_truncated: bool,
 }
@@ -128,47 +133,58 @@ pub(super) struct FileScan {
     pub(super) attributes: Attributes,
     pub(super) stations: Vec<Station>,
     pub(super) record_count: u64,
-    /// Records that gave no point, ascending.
-    pub(super) dropped_records: Vec<u64>,
+    /// Records that gave no point.
+    pub(super) dropped_records: DroppedRecords,
+    /// How many of them lie outside the part that was asked for.
+    pub(super) outside_part: u64,
     pub(super) info: FileInfo,
     pub(super) warnings: Vec<Warning>,
 }
 
 impl FileScan {
-    /// Adds scanner positions and, for each record, the scanner that saw it.
+    /// Adds stations and, for each record, the one that saw it.
     pub(super) fn set_stations(&mut self, stations: Vec<Station>, mut station_of_record: Vec<u16>) {
-        let mut dropped = self.dropped_records.iter().peekable();
-        let mut record = 0u64;
-        station_of_record.retain(|_| {
-            let gone = dropped.next_if(|d| **d == record).is_some();
-            record += 1;
-            !gone
-        });
+        let mut records = 0..;
+        station_of_record.retain(|_| records.next().is_some_and(|r| self.dropped_records.point_of(r).is_some()));
         self.attributes.station_ids = Some(station_of_record);
         self.stations = stations;
     }
 
+    /// Lets go of the points outside a part of the scan.
+    pub(super) fn keep_part(&mut self, part: &Part) {
+        let origin = self.origin;
+        let keep: Vec<bool> = self.positions.par_iter().map(|p| part.contains(&(p + origin))).collect();
+        self.outside_part += keep.iter().filter(|k| !**k).count() as u64;
+        self.dropped_records = self.dropped_records.and_points(&keep);
+        self.attributes.retain(&keep);
+        let mut kept = keep.iter();
+        self.positions.retain(|_| *kept.next().expect("one entry for each point"));
+        self.info.bounds = bounds(&self.positions).map(|b| b.map(|corner| (corner + origin).into()));
+    }
+
     /// A scan whose positions are still absolute: moves them next to a whole-unit origin.
     pub(super) fn relative(mut self, origin: Option<Vec3>) -> Self {
-        let (mut low, mut high) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
-        for p in &self.positions {
-            low = low.inf(p);
-            high = high.sup(p);
-        }
-        if self.positions.is_empty() {
+        let Some([low, high]) = bounds(&self.positions) else {
             self.origin = origin.unwrap_or_else(Vec3::zeros);
             return self;
-        }
+        };
         self.info.bounds = Some([low.into(), high.into()]);
         self.origin = origin.unwrap_or_else(|| whole_units(&((low + high) / 2.0)));
         if self.origin != Vec3::zeros() {
             self.positions.iter_mut().for_each(|p| *p -= self.origin);
         }
-        for station in &mut self.stations {
-            station.position_in_local -= self.origin;
+        for position in self.stations.iter_mut().filter_map(|s| s.position_in_local.as_mut()) {
+            *position -= self.origin;
         }
         self
     }
+}
+
+/// Lowest and highest coordinates.
+fn bounds(positions: &[Vec3]) -> Option<[Vec3; 2]> {
+    let mut positions = positions.iter();
+    let first = positions.next()?;
+    Some(positions.fold([*first; 2], |[low, high], p| [low.inf(p), high.sup(p)]))
 }
 
 /// An origin on whole hundreds of units near `point`; zero for coordinates that are small already.

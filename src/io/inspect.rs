@@ -62,8 +62,8 @@ pub struct ScanInfo {
 pub struct StationInfo {
     /// Its name.
     pub name: String,
-    /// Its position in the file's coordinates.
-    pub position: [f64; 3],
+    /// Its position in the file's coordinates, if the file tells it.
+    pub position: Option<[f64; 3]>,
 }
 
 /// Reads a whole file and tells what is in it.
@@ -172,7 +172,10 @@ fn scan_info(path: &Path, bytes: u64, mut scan: FileScan, points: u64, look: Loo
         stations: scan
             .stations
             .iter()
-            .map(|s| StationInfo { name: s.name.clone(), position: (s.position_in_local + scan.origin).into() })
+            .map(|s| StationInfo {
+                name: s.name.clone(),
+                position: s.position_in_local.map(|p| (p + scan.origin).into()),
+            })
             .collect(),
         header: scan.info.header,
         guards,

@@ -3,6 +3,7 @@
 use super::error::{COPY_AGAIN, Error};
 use super::mesh_scan::MeshBuilder;
 use super::source_bytes::SourceBytes;
+use super::text::Text;
 use crate::numeric::{Vec2, Vec3};
 use crate::warning::Warning;
 use std::borrow::Cow;
@@ -23,7 +24,8 @@ fn at_line(source: &SourceBytes, line: usize, text: &str, cause: &str) -> Error 
 
 /// Wavefront OBJ: `v`, `vt`, `f` (polygons, negative indices); everything else does not matter here.
 pub(super) fn obj(source: &SourceBytes) -> Result<MeshBuilder, Error> {
-    let bytes = source.up_to(0, usize::MAX)?;
+    let text = Text::of(source)?;
+    let bytes = text.source().up_to(text.start, usize::MAX)?;
     let text = String::from_utf8_lossy(&bytes);
     let mut builder = MeshBuilder::new("OBJ");
     let mut uvs: Vec<Vec2> = Vec::new();
@@ -298,14 +300,24 @@ impl Glb<'_> {
 
     fn primitive(&mut self, primitive: &serde_json::Value, matrix: &nalgebra::Matrix4<f64>) -> Result<(), String> {
         const TRIANGLES: u64 = 4;
-        if primitive["mode"].as_u64().unwrap_or(TRIANGLES) != TRIANGLES {
-            self.builder
-                .warnings
-                .push(Warning::new("glb-primitives", "points, lines and strips of the GLB are left out"));
+        const STRIP: u64 = 5;
+        const FAN: u64 = 6;
+        let mode = primitive["mode"].as_u64().unwrap_or(TRIANGLES);
+        if !(TRIANGLES..=FAN).contains(&mode) {
+            let warning = Warning::new("glb-primitives", "points and lines of the GLB are left out");
+            if !self.builder.warnings.contains(&warning) {
+                self.builder.warnings.push(warning);
+            }
             return Ok(());
         }
         let positions = self.accessor(&primitive["attributes"]["POSITION"], 3)?;
         let first = self.builder.vertices.len();
+        /// A small file may show one mesh a hundred thousand times; no mesh of a tunnel does.
+        const MOST_COPIES: usize = 64;
+        let most = (self.bin.len() / 12).saturating_mul(MOST_COPIES);
+        if first + positions.len() / 3 > most {
+            return Err(format!("its nodes show more than {most} vertices, {MOST_COPIES} times what its data holds"));
+        }
         for p in positions.chunks_exact(3) {
             let p = matrix * nalgebra::Vector4::new(p[0], p[1], p[2], 1.0);
             self.builder.vertices.push(p.xyz());
@@ -314,9 +326,18 @@ impl Glb<'_> {
             serde_json::Value::Null => (0..positions.len() / 3).map(|i| i as f64).collect(),
             indices => self.accessor(indices, 1)?,
         };
-        for corners in indices.chunks_exact(3) {
-            let shifted = [0, 1, 2].map(|k| corners[k] + first as f64);
-            self.builder.polygon(&shifted, None)?;
+        let triangles = match mode {
+            TRIANGLES => indices.len() / 3,
+            _ => indices.len().saturating_sub(2),
+        };
+        for i in 0..triangles {
+            let corners = match mode {
+                TRIANGLES => [3 * i, 3 * i + 1, 3 * i + 2],
+                // Every second triangle of a strip runs the other way round.
+                STRIP => [i, i + 1 + i % 2, i + 2 - i % 2],
+                _ => [i + 1, i + 2, 0],
+            };
+            self.builder.polygon(&corners.map(|k| indices[k] + first as f64), None)?;
         }
         Ok(())
     }

@@ -10,6 +10,7 @@ use super::source_bytes::SourceBytes;
 use super::text::{Line, parse_rows};
 use crate::cloud::Station;
 use crate::numeric::Vec3;
+use crate::warning::Warning;
 use rayon::prelude::*;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -71,12 +72,14 @@ struct Header {
     data: Data,
     data_at: u64,
     lines: u64,
+    warnings: Vec<Warning>,
 }
 
 /// Reads a PCD file.
 pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec3>) -> Result<FileScan, Error> {
     let path = source.path();
-    let header = read_header(source)?;
+    let mut header = read_header(source)?;
+    let warnings = std::mem::take(&mut header.warnings);
     // A colour is packed into the bits of one field: it is offered as three more columns.
     let holds_color = |f: &Field| ["rgb", "rgba"].contains(&f.name.as_str()) && f.size == 4 && f.count > 0;
     let packed = header.fields.iter().position(holds_color);
@@ -137,10 +140,13 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     info.single_precision = roles.position.iter().any(|&c| header.fields[c].size == 4);
     info.attributes
         .extend(names.iter().filter(|n| !n.is_empty() && *n != "intensity").map(|n| AttributeInfo::present(n)));
-    let mut scan = table.finish_absolute(&roles, info, Vec::new(), "a coordinate that is not a number");
+    let mut scan = table.finish_absolute(&roles, info, warnings, "a coordinate that is not a number");
     if header.viewpoint != Vec3::zeros() {
         let n = scan.record_count as usize;
-        scan.set_stations(vec![Station { name: "viewpoint".into(), position_in_local: header.viewpoint }], vec![0; n]);
+        scan.set_stations(
+            vec![Station { name: "viewpoint".into(), position_in_local: Some(header.viewpoint) }],
+            vec![0; n],
+        );
     }
     Ok(scan.relative(origin))
 }
@@ -247,6 +253,7 @@ fn read_header(source: &SourceBytes) -> Result<Header, Error> {
         data: Data::Ascii,
         data_at: 0,
         lines: 0,
+        warnings: Vec::new(),
     };
     let (mut names, mut sizes, mut kinds, mut counts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let (mut width, mut height, mut points, mut data) = (1u64, 1u64, None, None);
@@ -263,7 +270,8 @@ fn read_header(source: &SourceBytes) -> Result<Header, Error> {
             || whole(rest.first()).ok_or_else(|| bad(format!("header line '{}' has no valid number", text.trim())));
         match key {
             "VERSION" => header.version = rest.join(" "),
-            "FIELDS" => names = rest.iter().map(|n| n.to_ascii_lowercase()).collect(),
+            // The name before version 0.7.
+            "FIELDS" | "COLUMNS" => names = rest.iter().map(|n| n.to_ascii_lowercase()).collect(),
             "SIZE" => sizes = rest.iter().filter_map(|w| w.parse::<usize>().ok()).collect(),
             "TYPE" => kinds = rest.iter().map(|w| w.as_bytes()[0].to_ascii_uppercase()).collect(),
             "COUNT" => counts = rest.iter().filter_map(|w| w.parse::<usize>().ok()).collect(),
@@ -271,9 +279,13 @@ fn read_header(source: &SourceBytes) -> Result<Header, Error> {
             "HEIGHT" => height = number()?,
             "POINTS" => points = Some(number()?),
             "VIEWPOINT" => {
-                let v: Vec<f64> = rest.iter().take(3).filter_map(|w| w.parse().ok()).collect();
+                let v: Vec<f64> =
+                    rest.iter().take(3).filter_map(|w| w.parse().ok()).filter(|v: &f64| v.is_finite()).collect();
                 if let [x, y, z] = v[..] {
                     header.viewpoint = Vec3::new(x, y, z);
+                } else {
+                    let text = format!("its header line '{}' is no place of a scanner and ignored", text.trim());
+                    header.warnings.push(Warning::new("pcd-header", text));
                 }
             }
             "DATA" => {
@@ -318,6 +330,10 @@ fn read_header(source: &SourceBytes) -> Result<Header, Error> {
     }
     let product = width.checked_mul(height);
     header.points = points.or(product).unwrap_or(u64::MAX);
+    if points.is_some() && points != product {
+        let text = format!("its header counts {} points in a grid of {width} x {height}", header.points);
+        header.warnings.push(Warning::new("pcd-header", text));
+    }
     let stride: u64 = header.fields.iter().map(|f| (f.size * f.count) as u64).sum();
     let there = source.len() - header.data_at;
     let needed = match header.data {

@@ -3,7 +3,7 @@
 use super::error::Error;
 use super::file_scan::{AttributeInfo, FileInfo, FileScan, Settings};
 use super::label_column::{self, LabelSource};
-use crate::cloud::Attributes;
+use crate::cloud::{Attributes, DroppedRecords};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
 use std::path::Path;
@@ -62,6 +62,16 @@ impl Roles {
             source_id: first(&SOURCE_NAMES),
             label,
         }))
+    }
+
+    /// Whether a column means anything.
+    pub(super) fn use_column(&self, column: usize) -> bool {
+        let labels = matches!(&self.label, LabelSource::Column { index, .. } if *index == column);
+        let single = [self.intensity, self.classification, self.source_id];
+        labels
+            || self.position.contains(&column)
+            || self.color.is_some_and(|(channels, _)| channels.contains(&column))
+            || single.contains(&Some(column))
     }
 }
 
@@ -210,12 +220,12 @@ impl PointTable {
     ) -> FileScan {
         let record_count = self.len() as u64;
         let finite = |p: &[f64; 3]| p.iter().all(|c| c.is_finite());
-        let dropped: Vec<u64> =
+        let dropped: DroppedRecords =
             self.positions.iter().enumerate().filter(|(_, p)| !finite(p)).map(|(i, _)| i as u64).collect();
-        if !dropped.is_empty() {
+        if let Some(first) = dropped.first() {
             let keep: Vec<bool> = self.positions.iter().map(finite).collect();
             self.retain(&keep);
-            warnings.push(self::dropped(dropped.len() as u64, record_count, dropped[0], reason));
+            warnings.push(self::dropped(dropped.count(), record_count, first, reason));
         }
         if self.bad_labels > 0 {
             warnings.push(label_column::bad_values(self.bad_labels, &roles.label));
@@ -245,6 +255,7 @@ impl PointTable {
             stations: Vec::new(),
             record_count,
             dropped_records: dropped,
+            outside_part: 0,
             info,
             warnings,
         }

@@ -7,9 +7,16 @@ use std::path::{Path, PathBuf};
 /// An opened input whose length is known.
 #[derive(Debug)]
 pub(super) struct SourceBytes {
-    file: File,
+    content: Content,
     path: PathBuf,
     len: u64,
+}
+
+#[derive(Debug)]
+enum Content {
+    File(File),
+    /// What a file was converted to.
+    Memory(Vec<u8>),
 }
 
 impl SourceBytes {
@@ -23,7 +30,12 @@ impl SourceBytes {
         if len == 0 {
             return Err(Error::bad(path, "the file is empty (0 bytes)", super::error::COPY_AGAIN));
         }
-        Ok(Self { file, path: path.to_owned(), len })
+        Ok(Self { content: Content::File(file), path: path.to_owned(), len })
+    }
+
+    /// The same file with other content.
+    pub(super) fn with_content(&self, content: Vec<u8>) -> Self {
+        Self { len: content.len() as u64, content: Content::Memory(content), path: self.path.clone() }
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -36,7 +48,15 @@ impl SourceBytes {
 
     /// Fills `buffer` from byte `at` of the file.
     pub(super) fn read_at(&self, at: u64, buffer: &mut [u8]) -> Result<(), Error> {
-        read_exact_at(&self.file, buffer, at).map_err(|e| Error::read(&self.path, e))
+        let read = match &self.content {
+            Content::File(file) => read_exact_at(file, buffer, at),
+            Content::Memory(bytes) => usize::try_from(at)
+                .ok()
+                .and_then(|at| bytes.get(at..at.checked_add(buffer.len())?))
+                .map(|found| buffer.copy_from_slice(found))
+                .ok_or_else(|| std::io::ErrorKind::UnexpectedEof.into()),
+        };
+        read.map_err(|e| Error::read(&self.path, e))
     }
 
     /// `count` bytes from byte `at`; the caller has checked that the file holds them.

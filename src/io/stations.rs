@@ -1,9 +1,11 @@
 //! Scans of single stations, thinned: for residuals between them and for fine registration.
 
-use super::assemble::{contained, refuse_degrees};
+use super::assemble::{contained, read_file, refuse_degrees};
+use super::detect;
 use super::error::Error;
 use super::file_scan::Settings;
 use super::poses::{Pose, Poses};
+use super::source_bytes::SourceBytes;
 use super::stream::{Pass, ScanBox, Scope, Start, stream_file};
 use crate::cloud::Cloud;
 use crate::numeric::Vec3;
@@ -106,11 +108,13 @@ fn box_around(points: &[Vec3], margin: f64) -> Option<ScanBox> {
     Some(ScanBox { low: low.add_scalar(-margin), high: high.add_scalar(margin) })
 }
 
-/// One file as a station, thinned, in the coordinates of the scan.
+/// A station, thinned, in the coordinates of the scan: a file, or one of the scans in it.
 #[derive(Clone, Debug)]
 pub struct StationScan {
     /// The file.
     pub path: PathBuf,
+    /// Number of the station in the file, from 1, when the file has several.
+    pub station: Option<u16>,
     /// Its pose so far: that of [`Settings::poses`], or none.
     pub pose: Pose,
     /// Thinned points, scan coordinates with the pose applied, in the unit of the file.
@@ -119,11 +123,54 @@ pub struct StationScan {
     pub metres_per_unit: f64,
 }
 
-/// Reads a file as a station in one pass with bounded memory (see [`super::stream_positions`]).
+impl std::fmt::Display for StationScan {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.station {
+            Some(number) => write!(f, "station {number} of '{}'", self.path.display()),
+            None => write!(f, "'{}'", self.path.display()),
+        }
+    }
+}
+
+/// Reads the stations of a file: in one pass with bounded memory (see [`super::stream_positions`]) where a file is one
+/// station, whole where it may hold several (E57, PTX). Points of such a file that belong to no station are left out.
 ///
 /// # Errors
 /// As [`super::read_cloud`].
-pub fn read_station(path: &Path, settings: &Settings) -> Result<StationScan, Error> {
+pub fn read_stations(path: &Path, settings: &Settings) -> Result<Vec<StationScan>, Error> {
+    let poses = settings.poses.as_deref().map(Poses::read).transpose()?.unwrap_or_default().of(path);
+    let scan = |station: Option<u16>, thinned: Thinned, origin: &Vec3, metres_per_unit: f64| {
+        let pose = poses.of_station(station);
+        let points_in_scan = thinned.into_points().iter().map(|p| pose.apply_to(&(p + origin))).collect();
+        StationScan { path: path.to_owned(), station: station.map(|s| s + 1), pose, points_in_scan, metres_per_unit }
+    };
+    let unit = settings.unit.map(super::Unit::metres);
+    let several = contained(path, || Ok(detect::format_of(&SourceBytes::open(path)?)?.may_hold_stations()))?;
+    if several {
+        let file = read_file(path, settings, None, None)?;
+        refuse_degrees(path, &file, settings)?;
+        let metres_per_unit = unit.or(file.info.crs.as_ref().and_then(|c| c.metres_per_unit)).unwrap_or(1.0);
+        let empty = || Thinned::new(CELL_M / metres_per_unit, MOST_POINTS);
+        let mut thinned: Vec<Thinned> = file.stations.iter().map(|_| empty()).collect();
+        if let Some(ids) = file.attributes.station_ids.as_ref().filter(|_| thinned.len() > 1) {
+            for (p, &id) in file.positions.iter().zip(ids) {
+                if let Some(thinned) = thinned.get_mut(usize::from(id)) {
+                    thinned.add(p);
+                }
+            }
+            let numbered = thinned.into_iter().enumerate();
+            return Ok(numbered.map(|(i, t)| scan(Some(i as u16), t, &file.origin, metres_per_unit)).collect());
+        }
+        let mut whole = empty();
+        file.positions.iter().for_each(|p| whole.add(p));
+        return Ok(vec![scan(None, whole, &file.origin, metres_per_unit)]);
+    }
+    let (thinned, origin, metres_per_unit) = thin(path, settings, unit)?;
+    Ok(vec![scan(None, thinned, &origin, metres_per_unit)])
+}
+
+/// Thins a file in one pass: the points relative to an origin, that origin, and the length of the file's unit, metres.
+fn thin(path: &Path, settings: &Settings, unit: Option<f64>) -> Result<(Thinned, Vec3, f64), Error> {
     struct Thin {
         origin: Vec3,
         thinned: Thinned,
@@ -137,24 +184,16 @@ pub fn read_station(path: &Path, settings: &Settings) -> Result<StationScan, Err
             positions.iter().for_each(|p| self.thinned.add(p));
         }
     }
-    let poses = settings.poses.as_deref().map(Poses::read).transpose()?.unwrap_or_default();
-    contained(path, || {
-        let unit = settings.unit.map(super::Unit::metres);
-        // Cells are in the file's unit until that is known; a second pass is only needed for other units than metres.
-        let mut metres_per_unit = unit.unwrap_or(1.0);
-        loop {
-            let mut thin = Thin { origin: Vec3::zeros(), thinned: Thinned::new(CELL_M / metres_per_unit, MOST_POINTS) };
-            let (scan, _) = stream_file(path, settings, Scope::default(), &mut thin)?;
-            refuse_degrees(path, &scan, settings)?;
-            let stated = unit.or(scan.info.crs.as_ref().and_then(|c| c.metres_per_unit)).unwrap_or(1.0);
-            if stated != metres_per_unit {
-                metres_per_unit = stated;
-                continue;
-            }
-            let pose = poses.of(path).unwrap_or_else(Pose::identity);
-            let points = thin.thinned.into_points();
-            let points_in_scan = points.iter().map(|p| pose.apply_to(&(p + thin.origin))).collect();
-            return Ok(StationScan { path: path.to_owned(), pose, points_in_scan, metres_per_unit });
+    // Cells are in the file's unit until that is known; a second pass is only needed for other units than metres.
+    let mut metres_per_unit = unit.unwrap_or(1.0);
+    loop {
+        let mut thin = Thin { origin: Vec3::zeros(), thinned: Thinned::new(CELL_M / metres_per_unit, MOST_POINTS) };
+        let (scan, _) = stream_file(path, settings, Scope::default(), &mut thin)?;
+        refuse_degrees(path, &scan, settings)?;
+        let stated = unit.or(scan.info.crs.as_ref().and_then(|c| c.metres_per_unit)).unwrap_or(1.0);
+        if stated == metres_per_unit {
+            return Ok((thin.thinned, thin.origin, metres_per_unit));
         }
-    })
+        metres_per_unit = stated;
+    }
 }

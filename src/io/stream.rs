@@ -80,7 +80,7 @@ pub(super) fn stream_file(
             }
             _ => {}
         }
-        let mut scan = read_file(path, settings, None)?;
+        let mut scan = read_file(path, settings, None, None)?;
         let positions = std::mem::take(&mut scan.positions);
         pass.begin(Start { records: scan.record_count, origin: scan.origin, seeds: Vec::new() });
         let origin = scan.origin;

@@ -117,7 +117,7 @@ pub fn write_cloud_in_steps(
 /// The cloud's point of a record, for records in order: dropped records have none.
 pub(super) struct PointOfRecord<'a> {
     first_point: usize,
-    dropped: &'a [u64],
+    dropped: &'a crate::cloud::DroppedRecords,
 }
 
 impl<'a> PointOfRecord<'a> {
@@ -127,10 +127,6 @@ impl<'a> PointOfRecord<'a> {
 
     /// Index of the point, `None` when the record was dropped.
     pub(super) fn get(&self, record: u64) -> Option<usize> {
-        let before = self.dropped.partition_point(|&d| d < record);
-        if self.dropped.get(before) == Some(&record) {
-            return None;
-        }
-        Some(self.first_point + record as usize - before)
+        self.dropped.point_of(record).map(|point| self.first_point + point as usize)
     }
 }

@@ -621,7 +621,7 @@ mod tests {
             first_point: 0,
             point_count: uv.len(),
             record_count: uv.len() as u64,
-            dropped_records: vec![],
+            dropped_records: Default::default(),
         };
         Cloud::new(ScanFrame::local(), positions, attributes, vec![source], vec![]).unwrap()
     }

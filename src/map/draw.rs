@@ -621,7 +621,7 @@ mod tests {
             first_point: 0,
             point_count: n,
             record_count: n as u64,
-            dropped_records: vec![],
+            dropped_records: Default::default(),
         };
         let cloud = Cloud::new(ScanFrame::local(), vec![Vec3::zeros(); n], attributes, vec![source], vec![]).unwrap();
         (cloud, uv, vec![0.0; n])

@@ -127,7 +127,7 @@ impl<'a> Viewpoints<'a> {
     /// Position of the station that saw scan point `index`.
     pub fn of_point(&self, index: usize) -> Option<Vec3> {
         let station = *self.station_of_point.get(index)?;
-        Some(self.stations.get(station as usize)?.position_in_local)
+        self.stations.get(station as usize)?.position_in_local
     }
 }
 
@@ -456,7 +456,7 @@ mod tests {
         let points: Vec<Vec3> =
             (0..400).map(|i| Vec3::new((i % 20) as f64 * 0.05, (i / 20) as f64 * 0.05, -1.0)).collect();
         let geometry = GeometryCloud::from_positions(points);
-        let stations = [Station { name: "a".into(), position_in_local: Vec3::new(0.5, 0.5, -3.0) }];
+        let stations = [Station { name: "a".into(), position_in_local: Some(Vec3::new(0.5, 0.5, -3.0)) }];
         let ids = vec![0u16; 400];
         let viewpoints = Viewpoints { stations: &stations, station_of_point: &ids };
         let (seen, summary) = estimate(&geometry, &straight(), viewpoints, &Settings::default()).unwrap();

@@ -195,7 +195,13 @@ fn prepare(pipeline: &Pipeline) -> Result<Prepared, Error> {
         |stage| match stage {
             "ingest" => {
                 let poses = poses_hash.iter().map(|h| ("poses".to_owned(), h.clone()));
-                input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone())).chain(poses).collect()
+                let files = input_hashes.iter().enumerate().map(|(i, h)| (format!("file {i}"), h.clone()));
+                // A stretch of chainages means what the axis makes of it.
+                let stretch = pipeline.ingest.chainage_m.into_iter().flat_map(|_| {
+                    let settings = ("axis".to_owned(), pipeline.settings_of("axis").to_string());
+                    alignment_hash.iter().map(|h| ("alignment".to_owned(), h.clone())).chain([settings])
+                });
+                files.chain(poses).chain(stretch).collect()
             }
             "axis" => alignment_hash.iter().map(|h| ("alignment".to_owned(), h.clone())).collect(),
             "unwrap" => handles_hash.iter().map(|h| ("handles".to_owned(), h.clone())).collect(),
@@ -251,7 +257,7 @@ fn run_in(
                 let message = format!("memory and disk are not estimated, because {error}");
                 observer.warned("ingest", &Warning::new("no-estimate", message));
             }
-            Err(error) => return Err(Error::in_stage("ingest")(error)),
+            Err(error) => return Err(error),
         }
         folder.note("run-begun", json!({ "adit_version": env!("CARGO_PKG_VERSION"), "input": pipeline.input }))?;
     }
@@ -291,7 +297,8 @@ enum Until {
 fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, until: Until) -> Result<(), Error> {
     let coordinates = OnceCell::new();
     let cloud = line.passing("ingest", |_| {
-        let read = done("ingest", io::read_cloud(&pipeline.input, &pipeline.ingest))?;
+        let part = part_of(pipeline)?;
+        let read = done("ingest", io::read_part(&pipeline.input, &pipeline.ingest, part.as_ref()))?;
         stamps.check()?;
         Ok(read)
     });
@@ -419,6 +426,13 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
 fn run_mesh<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>) -> Result<(), Error> {
     let coordinates = OnceCell::new();
     let raw = line.passing("ingest", |_| {
+        if pipeline.ingest.chainage_m.is_some() {
+            return Err(Error::in_stage("ingest")(io::Error::Settings {
+                key: "ingest.chainage_m",
+                cause: "a mesh is taken as a whole".into(),
+                remedy: "leave it out, or name the scan instead of the mesh".into(),
+            }));
+        }
         let read = done("ingest", io::read_mesh(&pipeline.input[0]))?;
         stamps.check()?;
         Ok(read)
@@ -559,11 +573,7 @@ fn find_axis(
         _ => {}
     }
     match &settings.alignment {
-        Some(path) => {
-            let text = std::fs::read_to_string(path)
-                .map_err(|source| Error::in_stage("axis")(io::Error::Read { path: path.clone(), source }))?;
-            done("axis", axis::import_csv(&text, frame, &settings))
-        }
+        Some(path) => done("axis", axis::import_csv(&read_alignment("axis", path)?, frame, &settings)),
         None => {
             let traced = axis::trace(points, &settings);
             let no_tunnel = matches!(traced, Err(axis::Error::NotATunnel { .. } | axis::Error::ClosedLoop { .. }));
@@ -578,6 +588,32 @@ fn find_axis(
             }
         }
     }
+}
+
+fn read_alignment(stage: &'static str, path: &Path) -> Result<String, Error> {
+    std::fs::read_to_string(path)
+        .map_err(|source| Error::in_stage(stage)(io::Error::Read { path: path.to_owned(), source }))
+}
+
+/// The part of the scan that `ingest.chainage_m` asks for; the axis must be known before the scan is.
+pub(super) fn part_of(pipeline: &Pipeline) -> Result<Option<io::Part>, Error> {
+    let Some(chainage_m) = pipeline.ingest.chainage_m else { return Ok(None) };
+    let in_ingest = Error::in_stage("ingest");
+    let Some(path) = &pipeline.axis.alignment else {
+        return Err(in_ingest(io::Error::Settings {
+            key: "ingest.chainage_m",
+            cause: "chainages are those of an axis that is known before the scan is read".into(),
+            remedy: "set axis.alignment too; the axis.csv of an earlier run will do".into(),
+        }));
+    };
+    let frame = ScanFrame {
+        metres_per_unit: pipeline.ingest.unit.map_or(1.0, io::Unit::metres),
+        ..ScanFrame::with_origin(Vec3::zeros())
+    };
+    let text = read_alignment("ingest", path)?;
+    let (axis, _) =
+        axis::import_csv(&text, &frame, &pipeline.axis.in_local(&frame)).map_err(Error::in_stage("ingest"))?;
+    io::Part::along(axis, frame, chainage_m).map(Some).map_err(Error::in_stage("ingest"))
 }
 
 /// A picture of what was seen when the axis is refused, in the run folder.

@@ -218,7 +218,7 @@ mod tests {
         let (oriented, _) =
             normals::estimate(&geometry, &axis, Viewpoints::of(&scan.cloud), &normals::Settings::default()).unwrap();
         let (segmentation, _) = classify_positions(geometry.positions(), &axis, &Settings::default()).unwrap();
-        let station = scan.cloud.stations()[0].position_in_local;
+        let station = scan.cloud.stations()[0].position_in_local.unwrap();
         let quality = Quality::of(&oriented, &segmentation, geometry.counts(), |_| Some(station));
         let place = |s: f64, angle: f64| axis.point_at(&crate::axis::AxisCoordinates::from_polar(s, angle, 2.0));
         // Beside the station, 4 m along, and behind the duct (at 48 degrees right of the crown).

@@ -568,12 +568,12 @@ fn assemble(plan: &ScanPlan, stations: &[Vec3], shots: Vec<(usize, Vec<Shot>)>) 
         first_point: 0,
         point_count: shots.len(),
         record_count: shots.len() as u64,
-        dropped_records: Vec::new(),
+        dropped_records: Default::default(),
     };
     let named = stations
         .iter()
         .enumerate()
-        .map(|(k, &p)| Station { name: format!("station {}", k + 1), position_in_local: p })
+        .map(|(k, &p)| Station { name: format!("station {}", k + 1), position_in_local: Some(p) })
         .collect();
     let frame = ScanFrame::with_origin(plan.origin_in_scan);
     let positions = shots.iter().map(|s| s.position).collect();
@@ -642,7 +642,8 @@ mod tests {
         let mut sum = 0.0;
         for (i, p) in scan.cloud.positions().iter().enumerate() {
             let hit = tunnel.surface_point(scan.truth.chainage_m[i], scan.truth.girth_m[i]);
-            let from = stations[scan.cloud.attributes().station_ids.as_ref().unwrap()[i] as usize].position_in_local;
+            let from =
+                stations[scan.cloud.attributes().station_ids.as_ref().unwrap()[i] as usize].position_in_local.unwrap();
             sum += ((p - from).norm() - (hit - from).norm()).powi(2);
         }
         let sigma = (sum / scan.cloud.len() as f64).sqrt();
@@ -679,7 +680,7 @@ mod tests {
         tunnel.furniture.extend(Item::vehicle(8.0, -1.0, tunnel.section.invert_up()));
         let plan = ScanPlan { station_chainages_m: vec![3.0], station_offset_m: 0.0, ..quiet(20_000) };
         let scan = scan(&tunnel, &plan).unwrap();
-        let station = scan.cloud.stations()[0].position_in_local;
+        let station = scan.cloud.stations()[0].position_in_local.unwrap();
         let count = |surface| scan.truth.surface.iter().filter(|&&s| s == surface).count();
         assert!(count(Surface::Furniture) > 1_000 && count(Surface::Floor) > 500);
         let from = {

@@ -64,8 +64,8 @@ impl Nodes {
         Some(Self { boxes })
     }
 
-    /// Whether the chunk that begins at this byte may hold points of the box; chunks without a node may.
-    pub(super) fn may_meet(&self, chunk_at: u64, window: &ScanBox) -> bool {
-        self.boxes.get(&chunk_at).is_none_or(|node| node.meets(window))
+    /// Whether the chunk that begins at this byte may hold what is wanted, by the box around it; chunks without a node may.
+    pub(super) fn may_hold(&self, chunk_at: u64, wanted: impl Fn(&ScanBox) -> bool) -> bool {
+        self.boxes.get(&chunk_at).is_none_or(wanted)
     }
 }

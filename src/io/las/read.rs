@@ -3,11 +3,13 @@
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::file_scan::{FileInfo, FileScan, Settings};
 use super::super::label_column::{self, LabelSource};
+use super::super::part::Part;
 use super::super::source_bytes::SourceBytes;
+use super::copc::Nodes;
 use super::extra_bytes::{self, ExtraField};
 use super::header::Container;
 use super::records::{Chunk, Layout, Records};
-use crate::cloud::Attributes;
+use crate::cloud::{Attributes, DroppedRecords};
 use crate::numeric::Vec3;
 use crate::warning::Warning;
 use laz::DecompressionSelection;
@@ -18,9 +20,18 @@ type Bounds = [[f64; 3]; 2];
 
 /// How many points the header counts, and its bounding box in metres; the file holds the points, or (LAZ) the chunks that
 /// its table lists.
-pub(in super::super) fn announced_points(source: &SourceBytes) -> Result<(u64, Option<Bounds>), Error> {
+///
+/// With a `part`, the points of the chunks that may hold points of it, as far as the index of a COPC tells.
+pub(in super::super) fn announced_points(
+    source: &SourceBytes,
+    part: Option<&Part>,
+) -> Result<(u64, Option<Bounds>), Error> {
     let container = Container::read(source)?;
-    Records::plan(source, &container, false, &mut Vec::new())?;
+    let mut records = Records::plan(source, &container, false, &mut Vec::new())?;
+    if let Some((part, nodes)) = part.and_then(|part| Some((part, Nodes::of(source, &container)?))) {
+        records.keep(|chunk| nodes.may_hold(chunk.begins_at(), |node| part.may_meet(node)));
+        return Ok((records.count, None));
+    }
     let unit = super::crs::of(&container).and_then(|c| c.metres_per_unit).unwrap_or(1.0);
     let sound =
         (0..3).all(|i| container.max[i] > container.min[i] && (container.max[i] - container.min[i]).is_finite());
@@ -28,18 +39,32 @@ pub(in super::super) fn announced_points(source: &SourceBytes) -> Result<(u64, O
     Ok((container.count, bounds))
 }
 
-/// Reads one LAS or LAZ file; positions are relative to `origin`, or to one chosen from the header.
+/// Reads one LAS or LAZ file; positions are relative to `origin`, or to one chosen from the header. Chunks of a COPC that
+/// lie outside the `part` are not read.
 pub(in super::super) fn read(
     source: &SourceBytes,
     settings: &Settings,
     origin: Option<Vec3>,
+    part: Option<&Part>,
 ) -> Result<FileScan, Error> {
-    let opened = Opened::new(source, settings, origin)?;
+    let mut opened = Opened::new(source, settings, origin)?;
+    let record_count = opened.records.count;
+    let mut left_out = DroppedRecords::default();
+    if let Some((part, nodes)) = part.and_then(|part| Some((part, Nodes::of(source, &opened.container)?))) {
+        left_out = opened.records.keep(|chunk| nodes.may_hold(chunk.begins_at(), |node| part.may_meet(node)));
+    }
     let mut columns = Columns::allocate(source, &opened.records, &opened.layout, &opened.label)?;
     let facts = opened.decoder().decode(&opened.records, &mut columns)?;
     let mut scan = opened.scan(&facts);
     scan.attributes = columns.attributes(&facts);
     scan.positions = bytemuck::cast_vec(columns.positions);
+    if !left_out.is_empty() {
+        // The box is that of all points.
+        scan.warnings.retain(|w| w.code != "las-bounding-box");
+    }
+    scan.record_count = record_count;
+    scan.outside_part = left_out.count();
+    scan.dropped_records = left_out;
     Ok(scan)
 }
 
@@ -113,7 +138,8 @@ impl<'a> Opened<'a> {
             attributes: Attributes::default(),
             stations: Vec::new(),
             record_count: records.count,
-            dropped_records: Vec::new(),
+            dropped_records: Default::default(),
+            outside_part: 0,
             info,
             warnings,
         }

@@ -3,6 +3,7 @@
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::source_bytes::SourceBytes;
 use super::header::{Container, STANDARD_LENGTHS, u32_at, u64_at};
+use crate::cloud::DroppedRecords;
 use crate::warning::Warning;
 use laz::laszip::ChunkTable;
 use laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
@@ -101,6 +102,20 @@ impl<'a> Records<'a> {
         };
         let count = chunks.iter().map(|c| c.count).sum();
         Ok(Self { source, record_len, coding, chunks, count })
+    }
+
+    /// Leaves out the chunks that are not wanted; returns their records.
+    pub(super) fn keep(&mut self, wanted: impl Fn(&Chunk) -> bool) -> DroppedRecords {
+        let mut left_out = DroppedRecords::default();
+        self.chunks.retain(|chunk| {
+            let keep = wanted(chunk);
+            if !keep {
+                left_out.push(chunk.first, chunk.count);
+            }
+            keep
+        });
+        self.count -= left_out.count();
+        left_out
     }
 
     /// Decodes one chunk piece by piece: `visit` gets the number of the first record and whole records.

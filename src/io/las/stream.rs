@@ -24,9 +24,13 @@ pub(in super::super) fn stream(
 ) -> Result<(FileScan, u64), Error> {
     let opened = Opened::new(source, settings, None)?;
     let chunks = match scope.window.and_then(|w| Some((w, Nodes::of(source, &opened.container)?))) {
-        Some((window, nodes)) => {
-            opened.records.chunks.iter().copied().filter(|c| nodes.may_meet(c.begins_at(), window)).collect()
-        }
+        Some((window, nodes)) => opened
+            .records
+            .chunks
+            .iter()
+            .copied()
+            .filter(|c| nodes.may_hold(c.begins_at(), |node| node.meets(window)))
+            .collect(),
         None => opened.records.chunks.clone(),
     };
     let attributes = scope.ranges.then(|| Attributes::of(&opened.container, &opened.fields));

@@ -134,7 +134,8 @@ pub(in super::super) fn stream(
         attributes: Attributes::default(),
         stations: Vec::new(),
         record_count: count,
-        dropped_records: Vec::new(),
+        dropped_records: Default::default(),
+        outside_part: 0,
         info,
         warnings,
     };

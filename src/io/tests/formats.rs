@@ -3,25 +3,25 @@
 use super::*;
 
 /// Writes `bytes` under `name` and reads them with `settings`.
-fn read_bytes(name: &str, bytes: &[u8], settings: &Settings) -> Result<(Cloud, Summary), Error> {
+pub(super) fn read_bytes(name: &str, bytes: &[u8], settings: &Settings) -> Result<(Cloud, Summary), Error> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
     std::fs::write(&path, bytes).unwrap();
     read_cloud(&[path], settings)
 }
 
-fn scan(name: &str, bytes: &[u8]) -> (Cloud, Summary) {
+pub(super) fn scan(name: &str, bytes: &[u8]) -> (Cloud, Summary) {
     read_bytes(name, bytes, &Settings::default()).unwrap()
 }
 
-fn mesh(name: &str, bytes: &[u8]) -> Result<(RawMesh, MeshSummary), Error> {
+pub(super) fn mesh(name: &str, bytes: &[u8]) -> Result<(RawMesh, MeshSummary), Error> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
     std::fs::write(&path, bytes).unwrap();
     read_mesh(&path)
 }
 
-fn in_scan(cloud: &Cloud) -> Vec<Vec3> {
+pub(super) fn in_scan(cloud: &Cloud) -> Vec<Vec3> {
     cloud.positions().iter().map(|p| cloud.frame().scan_from_local(p)).collect()
 }
 
@@ -60,7 +60,7 @@ fn pts_counts_are_checked() {
     assert!(error.contains("promises 3 points, but 1 follow"), "{error}");
 }
 
-const PTX: &str = "2\n1\n10 0 0\n1 0 0\n0 1 0\n0 0 1\n0 1 0 0\n-1 0 0 0\n0 0 1 0\n10 20 30 1\n1 0 0 0.5\n0 0 0 0.5\n\
+pub(super) const PTX: &str = "2\n1\n10 0 0\n1 0 0\n0 1 0\n0 0 1\n0 1 0 0\n-1 0 0 0\n0 0 1 0\n10 20 30 1\n1 0 0 0.5\n0 0 0 0.5\n\
                    1\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 5 1\n0 1 0 0.25\n";
 
 #[test]
@@ -68,9 +68,9 @@ fn ptx_poses_and_lost_echoes() {
     let (cloud, summary) = scan("a.ptx", PTX.as_bytes());
     // The first matrix turns x into y (rows are images of the axes) and moves to (10, 20, 30).
     assert_eq!(in_scan(&cloud), [Vec3::new(10.0, 21.0, 30.0), Vec3::new(0.0, 1.0, 5.0)]);
-    assert_eq!(cloud.sources()[0].dropped_records, [1]);
+    assert_eq!(cloud.sources()[0].dropped_records, [1].into_iter().collect());
     assert_eq!(cloud.attributes().station_ids.as_deref(), Some(&[0, 1][..]));
-    assert_eq!(cloud.stations()[0].position_in_local, Vec3::new(10.0, 20.0, 30.0));
+    assert_eq!(cloud.stations()[0].position_in_local, Some(Vec3::new(10.0, 20.0, 30.0)));
     assert_eq!(summary.files[0].dropped, 1);
 }
 
@@ -81,7 +81,7 @@ fn a_mirroring_ptx_matrix_is_reported() {
     assert!(summary.warnings.iter().any(|w| w.code == "mirrored-axes"), "{:?}", summary.warnings);
 }
 
-fn pcd(data: &str, body: &[u8]) -> Vec<u8> {
+pub(super) fn pcd(data: &str, body: &[u8]) -> Vec<u8> {
     let header = format!(
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb label\nSIZE 4 4 4 4 2\nTYPE F F F U U\nCOUNT 1 1 1 1 1\nWIDTH 2\n\
          HEIGHT 1\nVIEWPOINT 1 2 3 1 0 0 0\nPOINTS 2\nDATA {data}\n"
@@ -117,7 +117,7 @@ fn pcd_binary_and_compressed_agree() {
     assert_eq!(a.attributes().colors.as_deref(), Some(&[[65535, 128 * 257, 0], [0, 0, 65535]][..]));
     assert_eq!(a.attributes().labels.as_deref(), Some(&[7, 9][..]));
     assert_eq!((a.positions(), a.attributes()), (b.positions(), b.attributes()));
-    assert_eq!(a.stations()[0].position_in_local, Vec3::new(1.0, 2.0, 3.0));
+    assert_eq!(a.stations()[0].position_in_local, Some(Vec3::new(1.0, 2.0, 3.0)));
 }
 
 #[test]
@@ -150,7 +150,7 @@ fn e57_poses_and_invalid_points() {
         assert!((p - expected).amax() < 1e-12, "{p}");
     }
     assert_eq!((cloud.len(), summary.files[0].dropped), (2, 1));
-    assert_eq!(cloud.stations()[0].position_in_local, Vec3::new(100.0, 200.0, 300.0));
+    assert_eq!(cloud.stations()[0].position_in_local, Some(Vec3::new(100.0, 200.0, 300.0)));
 }
 
 #[test]
@@ -258,7 +258,7 @@ fn poses_from_a_file() {
     let settings = Settings { poses: Some(poses.clone()), ..Default::default() };
     let (cloud, _) = read_cloud(std::slice::from_ref(&scan), &settings).unwrap();
     assert_eq!(in_scan(&cloud), [Vec3::new(500_000.0, 1.0, 2.0), Vec3::new(500_000.0, 2.0, 2.0)]);
-    let station = cloud.frame().scan_from_local(&cloud.stations()[0].position_in_local);
+    let station = cloud.frame().scan_from_local(&cloud.stations()[0].position_in_local.unwrap());
     assert_eq!(station, Vec3::new(500_000.0, 0.0, 2.0));
     std::fs::write(&poses, pose.replacen("-1.0", "1.0", 1)).unwrap();
     let error = read_cloud(&[scan], &settings).unwrap_err();
@@ -267,7 +267,7 @@ fn poses_from_a_file() {
 }
 
 /// A rough tunnel along x as seen by one station, about itself.
-fn station(seed: u32, place: impl Fn(Vec3) -> Vec3) -> String {
+pub(super) fn station(seed: u32, place: impl Fn(Vec3) -> Vec3) -> String {
     let random = |i: u32| {
         let mut h = u64::from(i).wrapping_add(u64::from(seed) << 33).wrapping_mul(0x9e37_79b9_7f4a_7c15);
         h = (h ^ (h >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -304,7 +304,12 @@ fn residuals_between_stations_and_points_that_a_pose_moves() {
     // The pose takes the lift of 3 cm back, and both far away.
     let poses = folder.path().join("poses.toml");
     let pose = |z| Pose { rotation: crate::numeric::Mat3::identity(), translation: far + Vec3::new(0.0, 0.0, z) };
-    let scans = [("s1.laz", 0.0), ("s2.laz", -0.03)].map(|(f, z)| (PathBuf::from(f), pose(z), "a remark".to_owned()));
+    let scans = [("s1.laz", 0.0), ("s2.laz", -0.03)].map(|(file, z)| PoseEntry {
+        file: file.into(),
+        station: None,
+        pose: pose(z),
+        remark: "a remark".to_owned(),
+    });
     write_poses(&poses, &scans).unwrap();
     let settings = Settings { poses: Some(poses), ..Default::default() };
     let (cloud, summary) = read_cloud(&paths, &settings).unwrap();

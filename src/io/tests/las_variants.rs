@@ -1,7 +1,6 @@
 //! Files that Adit does not write itself: every version with every point format, extra bytes of every type, waveform
 //! and extended records, several chunk forms of LAZ. Made here byte by byte, so that nothing comes from elsewhere.
 
-use super::super::las;
 use super::*;
 use crate::io::{ScanBox, stream_positions};
 
@@ -10,7 +9,7 @@ const LENGTHS: [usize; 11] = [20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67];
 
 /// What a made file has.
 #[derive(Clone, Copy)]
-struct Made {
+pub(super) struct Made {
     minor: u8,
     format: u8,
     points: usize,
@@ -21,7 +20,12 @@ struct Made {
 }
 
 impl Made {
-    fn new(minor: u8, format: u8, points: usize) -> Self {
+    /// The same with coordinates in other steps.
+    pub(super) fn in_steps(self, step: f64) -> Self {
+        Self { scale: [step; 3], ..self }
+    }
+
+    pub(super) fn new(minor: u8, format: u8, points: usize) -> Self {
         Self { minor, format, points, extra: &[], scale: [0.001, 0.002, 0.0005], extended_records: false }
     }
 
@@ -52,7 +56,7 @@ impl Made {
         [i as i32 * 100 - 50, (i % 17) as i32 * 250, -((i % 23) as i32)]
     }
 
-    fn position(&self, i: usize) -> Vec3 {
+    pub(super) fn position(&self, i: usize) -> Vec3 {
         Vec3::from_fn(|axis, _| f64::from(self.raw(i)[axis]) * self.scale[axis] + [1000.0, 2000.0, -5.0][axis])
     }
 
@@ -274,7 +278,7 @@ fn a_negative_scale_turns_the_axis_and_not_the_bounds() {
 }
 
 /// A LAZ file with the given LASzip record around the points of `made`.
-fn laz_of(made: &Made, vlr: laz::LazVlr, chunks: &[usize]) -> Vec<u8> {
+pub(super) fn laz_of(made: &Made, vlr: laz::LazVlr, chunks: &[usize]) -> Vec<u8> {
     let plain = made.bytes();
     let points_at = u32::from_le_bytes(plain[96..100].try_into().unwrap()) as usize;
     let mut payload = Vec::new();
@@ -333,7 +337,7 @@ fn chunks_of_any_form_are_read() {
 }
 
 /// All positions of a file through the stream, scan coordinates.
-fn streamed(path: &Path, window: Option<&ScanBox>) -> Vec<Vec3> {
+pub(super) fn streamed(path: &Path, window: Option<&ScanBox>) -> Vec<Vec3> {
     let mut all = Vec::new();
     let count = stream_positions(path, &Settings::default(), window, &mut |batch, origin| {
         all.extend(batch.iter().map(|p| p + origin));
@@ -368,62 +372,4 @@ fn the_stream_gives_what_reading_gives() {
         let (lowest, highest) = crate::spatial::voxel_grid::bounds(&expected).unwrap();
         assert!((Vec3::from(low) - lowest).amax() < 1e-9 && (Vec3::from(high) - highest).amax() < 1e-9, "{name}");
     }
-}
-
-/// Two nodes of an octree as COPC: the index says which chunk lies where.
-#[test]
-fn the_index_of_copc_leaves_out_what_lies_elsewhere() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a.copc.laz");
-    let made = Made { scale: [0.01; 3], ..Made::new(4, 6, 200) };
-    let vlr = laz::LazVlrBuilder::default().with_point_format(6, 0).unwrap().with_variable_chunk_size().build();
-    let mut bytes = laz_of(&made, vlr, &[100, 100]);
-    let first_chunk = u64::from(u32::from_le_bytes(bytes[96..100].try_into().unwrap())) + 8;
-    std::fs::write(&path, &bytes).unwrap();
-    let (cloud, _) = read(&path);
-    let middle = made.position(100);
-    // The chunk lengths, from the plan of the reader itself.
-    let second_chunk = las::chunk_starts(&path)[1];
-    // Records come in the order of x: the first hundred lie below the middle.
-    let low = Vec3::new(middle.x - 512.0, 1900.0, -400.0);
-    let mut info = vec![0u8; 160];
-    for (at, v) in [(0, low.x + 512.0), (8, low.y + 512.0), (16, low.z + 512.0), (24, 512.0)] {
-        info[at..at + 8].copy_from_slice(&v.to_le_bytes());
-    }
-    let hierarchy_at = bytes.len() as u64 + 60;
-    info[40..48].copy_from_slice(&hierarchy_at.to_le_bytes());
-    info[48..56].copy_from_slice(&64u64.to_le_bytes());
-    // The info record goes behind the points as an extended one; the page right after its header.
-    let mut page = Vec::new();
-    for (x, at) in [(0u32, first_chunk), (1, second_chunk)] {
-        for v in [1u32, x, 0, 0] {
-            page.extend(v.to_le_bytes());
-        }
-        page.extend(at.to_le_bytes());
-        page.extend(1u32.to_le_bytes());
-        page.extend(100i32.to_le_bytes());
-    }
-    let evlrs_at = bytes.len() as u64;
-    for (id, data) in [(1000u16, &page), (1, &info)] {
-        let mut v = vec![0u8; 60];
-        v[2..6].copy_from_slice(b"copc");
-        v[18..20].copy_from_slice(&id.to_le_bytes());
-        v[20..28].copy_from_slice(&(data.len() as u64).to_le_bytes());
-        bytes.extend(v);
-        bytes.extend(data);
-    }
-    bytes[235..243].copy_from_slice(&evlrs_at.to_le_bytes());
-    bytes[243..247].copy_from_slice(&2u32.to_le_bytes());
-    std::fs::write(&path, &bytes).unwrap();
-    let window =
-        ScanBox { low: middle - Vec3::new(20.25, 500.0, 500.0), high: middle + Vec3::new(-1.25, 500.0, 500.0) };
-    let expected = cloud.positions().iter().filter(|p| window.contains(&cloud.frame().scan_from_local(p))).count();
-    assert_eq!(streamed(&path, Some(&window)).len(), expected);
-    assert!(expected > 0 && expected < 100);
-    // Damage in the second chunk, which lies outside the window, is never met; a full read meets it.
-    let from = second_chunk as usize + 31;
-    bytes[from..from + 40].fill(0xff);
-    std::fs::write(&path, &bytes).unwrap();
-    assert_eq!(streamed(&path, Some(&window)).len(), expected);
-    assert!(read_cloud(&[path], &Settings::default()).is_err());
 }

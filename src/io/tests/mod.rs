@@ -1,8 +1,10 @@
 //! Round trips through real files.
 
+mod dialects;
 mod formats;
 mod guards;
 mod las_variants;
+mod parts;
 
 use super::*;
 use crate::cloud::{Attributes, Cloud, ScanFrame, SourceFile};
@@ -27,7 +29,7 @@ fn cloud(n: usize) -> Cloud {
         first_point: 0,
         point_count: n,
         record_count: n as u64,
-        dropped_records: vec![],
+        dropped_records: Default::default(),
     };
     Cloud::new(frame, positions, attributes, vec![source], vec![]).unwrap()
 }

@@ -17,9 +17,9 @@ const LONGEST_LINE: usize = 1 << 16;
 pub(in super::super) struct Line {
     /// The separator; blanks and tabs always separate too, unless they are all there is.
     pub(in super::super) separator: u8,
-    /// Numbers are written with a decimal comma.
+    /// A comma in a number is a decimal comma.
     pub(in super::super) decimal_comma: bool,
-    /// Numbers in a line; more are ignored.
+    /// Words of a line that are looked at; more are ignored.
     pub(in super::super) columns: usize,
 }
 
@@ -33,20 +33,27 @@ impl Line {
             .filter(move |w| !blank || !w.is_empty())
     }
 
-    fn number(&self, word: &[u8]) -> Option<f64> {
-        let text = std::str::from_utf8(word).ok()?;
-        if self.decimal_comma && text.contains(',') {
-            return text.replace(',', ".").parse().ok();
-        }
-        text.trim_matches('"').parse().ok()
+    /// The number that a word means.
+    pub(super) fn number(&self, word: &[u8]) -> Option<f64> {
+        let text = std::str::from_utf8(word).ok()?.trim_matches('"');
+        text.parse().ok().or_else(|| self.unusual_number(text))
     }
 
-    /// The numbers of a line, or why it has not enough.
-    fn row(&self, line: &[u8], row: &mut Vec<f64>) -> Result<(), String> {
+    /// A number with a decimal comma, or with the exponent `D` of Fortran.
+    fn unusual_number(&self, text: &str) -> Option<f64> {
+        if !text.bytes().all(|b| b.is_ascii_digit() || b"+-.,eEdD".contains(&b)) || text.ends_with(',') {
+            return None;
+        }
+        let text = text.replace(['d', 'D'], "e");
+        if self.decimal_comma { text.replace(',', ".").parse().ok() } else { text.parse().ok() }
+    }
+
+    /// The numbers of a line, or why it has not enough; columns that are not `used` are not looked at.
+    fn row(&self, line: &[u8], used: &[bool], row: &mut Vec<f64>) -> Result<(), String> {
         row.clear();
-        for word in self.words(line).take(self.columns) {
+        for (word, used) in self.words(line).zip(used) {
             // An empty field of a CSV is a missing value.
-            let number = if word.is_empty() { Some(f64::NAN) } else { self.number(word) };
+            let number = if word.is_empty() || !used { Some(f64::NAN) } else { self.number(word) };
             row.push(number.ok_or_else(|| format!("'{}' is not a number", shorten(word)))?);
         }
         if row.len() < self.columns {
@@ -77,6 +84,7 @@ pub(in super::super) fn parse_rows(
     line: &Line,
     roles: &Roles,
 ) -> Result<(PointTable, u64, u64), Error> {
+    let used: Vec<bool> = (0..line.columns).map(|column| roles.use_column(column)).collect();
     let mut table = PointTable::new(0, roles);
     let mut at = from;
     let mut number = first_line;
@@ -99,7 +107,7 @@ pub(in super::super) fn parse_rows(
             window.truncate(end_of_lines(&window, left));
         }
         let blocks = split_blocks(&window);
-        let parsed: Vec<Block> = blocks.par_iter().map(|block| parse_block(block, line, roles)).collect();
+        let parsed: Vec<Block> = blocks.par_iter().map(|block| parse_block(block, line, &used, roles)).collect();
         for block in parsed {
             if let Some((offset, cause)) = block.failure {
                 let cause = format!("line {}: {cause}", number + offset);
@@ -119,7 +127,7 @@ struct Block {
     failure: Option<(u64, String)>,
 }
 
-fn parse_block(text: &[u8], line: &Line, roles: &Roles) -> Block {
+fn parse_block(text: &[u8], line: &Line, used: &[bool], roles: &Roles) -> Block {
     let lines: Vec<&[u8]> = text.split_inclusive(|&b| b == b'\n').collect();
     let rows = lines.iter().filter(|l| !is_void(l)).count();
     let mut table = PointTable::new(rows, roles);
@@ -132,7 +140,7 @@ fn parse_block(text: &[u8], line: &Line, roles: &Roles) -> Block {
             let parsed = if text.len() > LONGEST_LINE {
                 Err("it is too long".into())
             } else {
-                line.row(text.trim_ascii(), &mut row)
+                line.row(text.trim_ascii(), used, &mut row)
             };
             match parsed {
                 Ok(()) => slots[0].set(next, roles, &mut bad_labels, |column| row[column]),

@@ -1,10 +1,12 @@
 //! XYZ, CSV, TXT and PTS: one point a line.
 
+use super::super::crs::Crs;
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::file_scan::{AttributeInfo, FileInfo, FileScan, Settings};
 use super::super::point_table::{ColorRange, Roles};
 use super::super::source_bytes::SourceBytes;
 use super::columns;
+use super::encoding::Text;
 use super::lines::parse_rows;
 use crate::numeric::Vec3;
 use crate::warning::Warning;
@@ -19,14 +21,14 @@ pub(in super::super) fn read(
     origin: Option<Vec3>,
     format: &'static str,
 ) -> Result<FileScan, Error> {
+    let text = Text::of(source)?;
+    let source = text.source();
     let path = source.path();
-    let head = source.up_to(0, HEAD)?;
-    let head_without_mark = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&head);
-    let mark = (head.len() - head_without_mark.len()) as u64;
+    let head = source.up_to(text.start, HEAD)?;
     if head.iter().take(4096).any(|&b| b == 0) {
         return Err(Error::bad(path, "it contains zero bytes, so it is no text", "name the right file"));
     }
-    let layout = columns::detect(head_without_mark, settings.text_columns.as_deref()).map_err(|cause| {
+    let layout = columns::detect(&head, settings.text_columns.as_deref()).map_err(|cause| {
         Error::bad(path, cause, "name a scan, or set ingest.text_columns, e.g. [\"x\", \"y\", \"z\", \"intensity\"]")
     })?;
     let roles = Roles::of(path, &layout.names, settings, |_| ColorRange::Open)?.ok_or_else(|| Error::Settings {
@@ -35,8 +37,21 @@ pub(in super::super) fn read(
         remedy: "name all three coordinates".into(),
     })?;
     let mut warnings = Vec::new();
-    let (mut table, end, line) =
-        parse_rows(source, mark + layout.header_bytes, layout.header_lines + 1, layout.promised, &layout.line, &roles)?;
+    if let Some((count, first)) = &layout.skipped {
+        let what = if *count == 1 { "line is" } else { "lines are" };
+        warnings.push(Warning::new(
+            "skipped-lines",
+            format!("{count} {what} neither numbers nor a header and skipped, before the first point: '{first}'"),
+        ));
+    }
+    let (mut table, end, line) = parse_rows(
+        source,
+        text.start + layout.header_bytes,
+        layout.header_lines + 1,
+        layout.promised,
+        &layout.line,
+        &roles,
+    )?;
     if let Some(promised) = layout.promised {
         if (table.len() as u64) < promised {
             let cause = format!("its first line promises {promised} points, but {} follow", table.len());
@@ -65,10 +80,14 @@ pub(in super::super) fn read(
         }
     }
     let mut info = FileInfo::new(format);
+    if layout.degrees {
+        info.crs = Some(Crs { text: "longitude and latitude".into(), degrees: true, metres_per_unit: None });
+    }
+    info.header("encoding", text.encoding);
     info.header("columns", &layout.names);
     info.header("columns_from", layout.origin);
     info.header("separator", (layout.line.separator as char).to_string());
-    info.header("decimal_comma", layout.line.decimal_comma);
+    info.header("decimal_comma", layout.decimal_comma);
     info.header("header_lines", layout.header_lines);
     for name in layout.names.iter().filter(|n| !n.is_empty() && *n != "intensity") {
         info.attributes.push(AttributeInfo::present(name));

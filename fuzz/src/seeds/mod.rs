@@ -1,5 +1,7 @@
 //! Sound small files to start from, written by Adit itself where it writes the format.
 
+mod las;
+
 use super::Target;
 use adit::cloud::{Attributes, Cloud, ScanFrame, SourceFile};
 use adit::io;
@@ -12,10 +14,11 @@ pub fn of(target: Target) -> Vec<Vec<u8>> {
         Target::Las => [(40, true), (3, false), (1, true)]
             .into_iter()
             .map(|(n, all)| written("a.las", n, all))
-            .chain(old_las())
+            .chain(las::las())
             .collect(),
         Target::Laz => {
-            [(400, true), (60, false), (1, true)].into_iter().map(|(n, all)| written("a.laz", n, all)).collect()
+            let own = [(400, true), (60, false), (1, true)].into_iter().map(|(n, all)| written("a.laz", n, all));
+            own.chain(las::laz()).collect()
         }
         Target::Ply => {
             let mut all = vec![written("a.ply", 20, true), written("a.ply", 2, false)];
@@ -81,7 +84,7 @@ fn written(name: &str, n: usize, with_attributes: bool) -> Vec<u8> {
         first_point: 0,
         point_count: n,
         record_count: n as u64,
-        dropped_records: vec![],
+        dropped_records: Default::default(),
     };
     let frame = ScanFrame::with_origin(Vec3::new(244_300.0, 6_010_900.0, 0.0));
     let cloud = Cloud::new(frame, positions, attributes, vec![source], vec![]).expect("equal columns");
@@ -95,32 +98,6 @@ fn in_file(name: &str, write: impl FnOnce(&Path)) -> Vec<u8> {
     let bytes = std::fs::read(&path).expect("what was written");
     let _ = std::fs::remove_file(&path);
     bytes
-}
-
-/// LAS 1.0 to 1.3 with the point formats that the writer does not choose: headers made by hand.
-fn old_las() -> Vec<Vec<u8>> {
-    let lengths = [20u16, 28, 26, 34, 57, 63];
-    (0..6u8)
-        .map(|format| {
-            let minor = [0, 1, 2, 2, 3, 3][usize::from(format)];
-            let header: u16 = if minor == 3 { 235 } else { 227 };
-            let mut bytes = vec![0u8; usize::from(header)];
-            bytes[..4].copy_from_slice(b"LASF");
-            (bytes[24], bytes[25]) = (1, minor);
-            bytes[94..96].copy_from_slice(&header.to_le_bytes());
-            bytes[96..100].copy_from_slice(&u32::from(header).to_le_bytes());
-            bytes[104] = format;
-            bytes[105..107].copy_from_slice(&lengths[usize::from(format)].to_le_bytes());
-            bytes[107..111].copy_from_slice(&3u32.to_le_bytes());
-            for axis in 0..3 {
-                bytes[131 + 8 * axis..139 + 8 * axis].copy_from_slice(&0.01f64.to_le_bytes());
-            }
-            for point in 0..3u8 {
-                bytes.extend((0..lengths[usize::from(format)]).map(|i| (i as u8).wrapping_mul(point)));
-            }
-            bytes
-        })
-        .collect()
 }
 
 fn big_endian_ply() -> Vec<u8> {
