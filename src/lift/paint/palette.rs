@@ -43,13 +43,15 @@ impl Palette {
         for (color, entry) in pairs {
             outcomes.entry(color).or_default().add(color, entry);
         }
+        let mut outcomes: Vec<([u8; 3], Outcomes)> = outcomes.into_iter().collect();
+        outcomes.sort_unstable_by_key(|(color, _)| *color);
         let (mut sums, mut count) = ([0; 3], 0);
         for (color, outcome) in &outcomes {
             (0..3).for_each(|k| sums[k] += outcome.seen * usize::from(color[k]));
             count += outcome.seen;
         }
         let mean = sums.map(|s| (s / count.max(1)) as u8);
-        let often = || outcomes.values().filter(|o| o.seen >= OFTEN);
+        let often = || outcomes.iter().map(|(_, o)| o).filter(|o| o.seen >= OFTEN);
         let (seen, same) = often().fold((0, 0), |(seen, same), o| (seen + o.seen, same + o.same));
         let is_dithered = (same as f64) < SAME_SHARE * seen as f64;
         let mut distances: Vec<(i32, usize)> = often().map(|o| (o.distance, o.seen)).collect();
