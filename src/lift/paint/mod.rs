@@ -167,8 +167,8 @@ pub fn recognise(
             break;
         }
         shown.extend(&new);
-        // Two colours that moved to one place are one.
-        let twin = |k: usize| shown[palette.len()..k].iter().any(|&c| distance(c, shown[k]) <= NEW_COLOR);
+        // Two colours that moved to one place are one, also where one of them is a class of the palette.
+        let twin = |k: usize| shown[..k].iter().any(|&c| distance(c, shown[k]) <= NEW_COLOR);
         let twins: Vec<usize> = (palette.len()..shown.len()).filter(|&k| twin(k)).collect();
         let first_twin = twins.first().copied().unwrap_or(usize::MAX);
         for k in twins.into_iter().rev() {
@@ -182,7 +182,11 @@ pub fn recognise(
         });
     }
     // Mixtures that were taken for colours of their own have hardly a pixel left.
-    let least = if rules.mixed { NEW_CLASS_PX_MIXED } else { NEW_CLASS_PX };
+    let least = match (rules.noisy, rules.mixed) {
+        (true, _) => NEW_CLASS_PX_NOISY,
+        (false, true) => NEW_CLASS_PX_MIXED,
+        (false, false) => NEW_CLASS_PX,
+    };
     let used = |k: usize| parts.iter().filter_map(|p| p.used.get(k)).sum::<usize>();
     let kept: Vec<[u8; 3]> = (palette.len()..shown.len()).filter(|&k| used(k) >= least).map(|k| shown[k]).collect();
     if kept.len() < shown.len() - palette.len() {
