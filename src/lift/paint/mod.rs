@@ -73,8 +73,9 @@ const MAX_ROUNDS: usize = 12;
 /// A class whose colour moves by less than this is left alone.
 const LEAST_MOVE: f64 = 2.5;
 const LEAST_MOVE_NOISY: f64 = 6.0;
-/// A new colour is at least this far from all classes.
+/// A new colour is at least this far from all classes, and in a JPEG from those of the palette.
 const NEW_COLOR: f64 = 24.0;
+const NEW_COLOR_LOSSY: f64 = 28.0;
 
 /// A picture of the map that may have been painted on.
 #[derive(Clone, Debug)]
@@ -168,7 +169,8 @@ pub fn recognise(
         }
         shown.extend(&new);
         // Two colours that moved to one place are one, also where one of them is a class of the palette.
-        let twin = |k: usize| shown[..k].iter().any(|&c| distance(c, shown[k]) <= NEW_COLOR);
+        let apart = |j: usize| if rules.lossy && j < palette.len() { NEW_COLOR_LOSSY } else { NEW_COLOR };
+        let twin = |k: usize| (0..k).any(|j| distance(shown[j], shown[k]) <= apart(j));
         let twins: Vec<usize> = (palette.len()..shown.len()).filter(|&k| twin(k)).collect();
         let first_twin = twins.first().copied().unwrap_or(usize::MAX);
         for k in twins.into_iter().rev() {
