@@ -179,6 +179,6 @@ mod tests {
     #[test]
     fn whole_samples_are_rounded() {
         assert_eq!((u8::nearest(2.5), u8::nearest(300.0), u16::nearest(1.49)), (3, 255, 1));
-        assert_eq!(Samples::filled(SampleType::F32, f64::NAN, 1).get(0).is_nan(), true);
+        assert!(Samples::filled(SampleType::F32, f64::NAN, 1).get(0).is_nan());
     }
 }
