@@ -129,7 +129,8 @@ pub struct Recognised {
 ///
 /// # Errors
 /// [`Error::Shape`] when the place of the picture is unknown, [`Error::NoBase`] when it is no picture of this map,
-/// [`Error::Ambiguous`] when too many painted pixels have no clear class.
+/// [`Error::Ambiguous`] when too many painted pixels have no clear class, [`Error::OneColor`] when they have the one colour that a
+/// palette gave to two classes.
 pub fn recognise(
     edited: &Edited,
     bases: &[Base],
