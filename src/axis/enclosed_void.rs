@@ -45,6 +45,11 @@ pub(super) struct EnclosedVoid {
 }
 
 impl EnclosedVoid {
+    /// Number of cells between each cell of the void and the nearest occupied one, at least 1, in the order of `cells`.
+    pub fn layers(&self) -> Vec<u32> {
+        layers(&self.grid, &self.cells)
+    }
+
     /// The void without what is no more than two cells thin: the inside of a wall that was scanned from both sides, and
     /// leaks where the scan of a wall has holes. `None` when nothing is left.
     pub fn without_thin_parts(&self) -> Option<Self> {
@@ -238,31 +243,36 @@ fn component_with_most_surface(grid: &Grid) -> Option<(Vec<usize>, usize)> {
     best
 }
 
-/// Largest number of cells between a cell of the void and the nearest occupied one, by peeling layers (26 and 6
-/// neighbours in turn, which makes the layers nearly round).
+/// Largest number of cells between a cell of the void and the nearest occupied one.
 fn clearance(grid: &Grid, cells: &[usize]) -> f64 {
+    f64::from(layers(grid, cells).into_iter().max().unwrap_or(0))
+}
+
+/// Number of cells between each cell of the void and the nearest occupied one, by peeling layers (26 and 6 neighbours in
+/// turn, which makes the layers nearly round); 0 where none is reached.
+fn layers(grid: &Grid, cells: &[usize]) -> Vec<u32> {
     let position = |cell: usize| cells.binary_search(&cell).ok();
-    let mut reached = vec![false; cells.len()];
+    let mut layer = vec![0; cells.len()];
     let mut front: Vec<usize> = (0..cells.len())
         .filter(|&i| grid.neighbours(cells[i], 26).any(|(n, _)| grid.states[n] == State::Occupied))
         .collect();
-    front.iter().for_each(|&i| reached[i] = true);
-    let mut layers = 0;
+    front.iter().for_each(|&i| layer[i] = 1);
+    let mut depth = 1;
     while !front.is_empty() {
-        layers += 1;
-        let count = if layers % 2 == 0 { 26 } else { 6 };
+        depth += 1;
+        let count = if depth % 2 == 1 { 26 } else { 6 };
         let mut next = Vec::new();
         for &i in &front {
             for (n, _) in grid.neighbours(cells[i], count) {
-                if let Some(j) = position(n).filter(|&j| !reached[j]) {
-                    reached[j] = true;
+                if let Some(j) = position(n).filter(|&j| layer[j] == 0) {
+                    layer[j] = depth;
                     next.push(j);
                 }
             }
         }
         front = next;
     }
-    layers as f64
+    layer
 }
 
 /// Directions spread evenly over the sphere (Fibonacci lattice: R. Swinbank, R. J. Purser, Q. J. R. Meteorol. Soc. 132,

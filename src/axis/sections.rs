@@ -257,7 +257,7 @@ pub(super) fn refine(
 }
 
 /// An axis through `knots`, continued straight by `by_m` at both ends.
-fn extended(knots: &[Vec3], by_m: f64) -> Result<Axis, Error> {
+pub(super) fn extended(knots: &[Vec3], by_m: f64) -> Result<Axis, Error> {
     let axis = Axis::through(knots, 0.0)?;
     let (start, end) = (axis.frame_at(0.0), axis.frame_at(axis.end_chainage()));
     let mut all = vec![start.origin - start.forward * by_m];

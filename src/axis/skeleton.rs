@@ -41,6 +41,8 @@ pub(super) struct Skeleton {
     pub branches: Vec<RoughBranch>,
     /// Whether the path ends at a portal, at its start and its end.
     pub ends_at_portal: [bool; 2],
+    /// Cells of the void at its start and its end, by their rank: a portal's, or one at the bottom of a dead end.
+    ends: [Vec<usize>; 2],
     /// Length of the shorter arm of the longest cycle, metres, if it is a loop and not just a pillar.
     pub loop_arm_m: Option<f64>,
     /// Cycles too short to be loops.
@@ -49,28 +51,40 @@ pub(super) struct Skeleton {
 
 /// Distances in the void, in metres, from a set of its cells (given by their rank in `cells`).
 fn distances(void: &EnclosedVoid, sources: &[usize]) -> Vec<f64> {
-    let mut distance = vec![f64::INFINITY; void.cells.len()];
+    cheapest(void, sources, |step, _, _| step).0
+}
+
+/// Least cost of a way from the `sources` to each cell, by rank, and the cell before it; `cost` of a step of some metres
+/// from one cell to another.
+fn cheapest(
+    void: &EnclosedVoid,
+    sources: &[usize],
+    cost: impl Fn(f64, usize, usize) -> f64,
+) -> (Vec<f64>, Vec<Option<usize>>) {
+    let mut least = vec![f64::INFINITY; void.cells.len()];
+    let mut from = vec![None; void.cells.len()];
     // Non-negative floats order as their bits.
     let mut queue: BinaryHeap<Reverse<(u64, usize)>> = BinaryHeap::new();
     for &s in sources {
-        distance[s] = 0.0;
+        least[s] = 0.0;
         queue.push(Reverse((0, s)));
     }
     while let Some(Reverse((bits, i))) = queue.pop() {
         let here = f64::from_bits(bits);
-        if here > distance[i] {
+        if here > least[i] {
             continue;
         }
         for (n, step) in void.grid.neighbours(void.cells[i], 26) {
             let Ok(j) = void.cells.binary_search(&n) else { continue };
-            let through = here + step * void.grid.cell_m;
-            if through < distance[j] {
-                distance[j] = through;
+            let through = here + cost(step * void.grid.cell_m, i, j);
+            if through < least[j] {
+                least[j] = through;
+                from[j] = Some(i);
                 queue.push(Reverse((through.to_bits(), j)));
             }
         }
     }
-    distance
+    (least, from)
 }
 
 /// Connected groups (26 neighbours) of the given ranks, each ascending, in order of their first rank.
@@ -117,10 +131,10 @@ fn far_end(distance: &[f64], portals: &[Vec<usize>], from: Option<usize>) -> (Ve
     let portal = (0..portals.len())
         .filter(|&p| Some(p) != from)
         .max_by(|&a, &b| mean_distance(distance, &portals[a]).total_cmp(&mean_distance(distance, &portals[b])));
+    // The far corner of a wide portal is no dead end.
+    let reach = |p: usize| portals[p].iter().map(|&r| distance[r]).fold(0.0, f64::max);
     match portal {
-        Some(p) if mean_distance(distance, &portals[p]) * DEAD_END_PREFERENCE >= distance[dead_end] => {
-            (portals[p].clone(), Some(p))
-        }
+        Some(p) if reach(p) * DEAD_END_PREFERENCE >= distance[dead_end] => (portals[p].clone(), Some(p)),
         _ => (vec![dead_end], None),
     }
 }
@@ -167,9 +181,7 @@ pub(super) fn skeleton(void: &EnclosedVoid, ends: Option<[Vec3; 2]>) -> Skeleton
     let mut main_cells: Vec<usize> =
         main.iter().flat_map(|&p| graph.pieces[p].iter().map(|&r| void.cells[r])).collect();
     main_cells.sort_unstable();
-    let mean = |ranks: &[usize]| -> Vec3 {
-        ranks.iter().map(|&r| grid.centre(void.cells[r])).sum::<Vec3>() / ranks.len() as f64
-    };
+    let mean = |ranks: &[usize]| mean_of(void, ranks);
     let path = main.iter().map(|&p| mean(&graph.pieces[p])).collect();
     let (branches, loop_arm_m, pillars) = graph.side_spaces(&main, &distance, void, mean, width);
     Skeleton {
@@ -177,9 +189,36 @@ pub(super) fn skeleton(void: &EnclosedVoid, ends: Option<[Vec3; 2]>) -> Skeleton
         main_cells,
         branches,
         ends_at_portal: [start_portal.is_some(), target_portal.is_some()],
+        ends: [start, target],
         loop_arm_m,
         pillars,
     }
+}
+
+impl Skeleton {
+    /// The middles of the portals that the path starts and ends at.
+    pub fn portals(&self, void: &EnclosedVoid) -> Vec<Vec3> {
+        let ends = self.ends.iter().zip(self.ends_at_portal).filter(|(_, portal)| *portal);
+        ends.map(|(ranks, _)| mean_of(void, ranks)).collect()
+    }
+
+    /// Cells from end to end along the widest way: the least sum of steps over squared distances from the wall.
+    pub fn widest_way(&self, void: &EnclosedVoid) -> Vec<Vec3> {
+        let layers = void.layers();
+        let width = |rank: usize| f64::from(layers[rank]).max(1.0);
+        let (cost, from) = cheapest(void, &self.ends[0], |step, a, b| step * 2.0 / (width(a).powi(2) + width(b).powi(2)));
+        let target = self.ends[1].iter().copied().min_by(|&a, &b| cost[a].total_cmp(&cost[b])).unwrap_or(0);
+        let mut way = vec![target];
+        while let Some(before) = from[way[way.len() - 1]] {
+            way.push(before);
+        }
+        way.reverse();
+        way.into_iter().map(|r| void.grid.centre(void.cells[r])).collect()
+    }
+}
+
+fn mean_of(void: &EnclosedVoid, ranks: &[usize]) -> Vec3 {
+    ranks.iter().map(|&r| void.grid.centre(void.cells[r])).sum::<Vec3>() / ranks.len() as f64
 }
 
 /// Connected pieces of bands of equal distance, and which pieces of the band before each one touches.

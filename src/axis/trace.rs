@@ -7,7 +7,7 @@
 //! refused with numbers. Guarantees: the same axis for any number of threads.
 
 use super::enclosed_void::{EnclosedVoid, State, edge_for, enclosed_void};
-use super::sections::{DIRECTIONS, NEAR, Refined, direction_of, refine, slice};
+use super::sections::{self, DIRECTIONS, NEAR, Refined, direction_of, refine, slice};
 use super::skeleton::{self, Skeleton};
 use super::{Axis, AxisCoordinates, Error};
 use crate::clean::Spacing;
@@ -45,6 +45,15 @@ const REACH_RADII: f64 = 8.0;
 const PORTAL_COVERAGE: f64 = 0.72;
 /// Usual share of directions with surface below which there is no section: one wall of a tunnel has half.
 const LEAST_COVERAGE: f64 = 0.3;
+/// An axis that passes a portal's middle at more than this many radii has missed it.
+const MISSED_RADII: f64 = 0.6;
+/// An axis that runs through rock for more than this share of its length is none.
+const MOST_BURIED: f64 = 0.02;
+/// A tunnel that turns by more than this in all, and with a smaller radius than this many of its section's, bends sharply.
+const SHARP_TURN_DEG: f64 = 40.0;
+const SHARPEST_RADII: f64 = 4.0;
+/// How often the middle of the void is smoothed.
+const SMOOTHING_PASSES: usize = 6;
 /// In the outermost slice the tunnel begins where this share of the directions has begun.
 const BEGUN: f64 = 0.15;
 /// Steeper than this from end to end, chainage runs downwards.
@@ -240,15 +249,31 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let rough = rough_axis(&skeleton, &void)?;
     let volume = skeleton.main_cells.len() as f64 * void.grid.cell_m.powi(3);
     let radius_m = (volume / rough.length().max(void.clearance_m) / std::f64::consts::PI).sqrt().max(void.clearance_m);
-    let surface = surface_of(&sample, &void, &skeleton, &rough, radius_m);
+    let mut surface = surface_of(&sample, &void, &skeleton.main_cells, &rough, radius_m);
     let least_step_m = (1.3 * spacing.across_m).max(3.0 * spacing.along_m);
-    let refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
+    let mut refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
+    let mut knot_spacing_m = refined.radius_m;
+    if let Some(bend) = sharp_bend(&skeleton, &void, &refined, radius_m)? {
+        knot_spacing_m = 0.5 * radius_m;
+        warnings.push(Warning::new(
+            "sharp-bend",
+            format!(
+                "the tunnel turns by {:.0} degrees within {:.1} m, and its section is {:.1} m wide: the axis follows the middle of \
+                 the void, because sections overlap",
+                bend.turns_deg,
+                bend.length_m,
+                2.0 * radius_m
+            ),
+        ));
+        refined = bend.refined;
+        surface = surface_of(&sample, &void, &void.cells, &refined.axis, radius_m);
+    }
     let (range, coverage) = covered_range(&surface, &refined, least_step_m)
         .ok_or_else(|| not_a_tunnel("no section is covered well enough", Some(&void), rough.length()))?;
     if coverage < LEAST_COVERAGE {
         return Err(not_a_tunnel("too little of any section around the axis has surface", Some(&void), rough.length()));
     }
-    let knots = knots_between(&refined.axis, range, refined.radius_m);
+    let knots = knots_between(&refined.axis, range, knot_spacing_m);
     let start_chainage = settings.start_chainage_m.unwrap_or(0.0);
     let forwards = Axis::through(&knots, start_chainage)?;
     let flipped = is_against_direction(&forwards, settings);
@@ -269,7 +294,7 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
             ),
         ));
     }
-    let branches = branches(&skeleton, &axis);
+    let branches = branches(&skeleton, &axis, refined.radius_m);
     if !branches.is_empty() {
         let list: Vec<String> = branches
             .iter()
@@ -406,8 +431,8 @@ fn rough_axis(skeleton: &Skeleton, void: &EnclosedVoid) -> Result<Axis, Error> {
     Axis::through(&knots, 0.0)
 }
 
-/// Points on the surface of the main void, and those that continue it beyond its ends.
-fn surface_of(points: &[Vec3], void: &EnclosedVoid, skeleton: &Skeleton, rough: &Axis, radius_m: f64) -> Vec<Vec3> {
+/// Points on the surface of these cells of the void, and those that continue it beyond its ends.
+fn surface_of(points: &[Vec3], void: &EnclosedVoid, main_cells: &[usize], rough: &Axis, radius_m: f64) -> Vec<Vec3> {
     let grid = &void.grid;
     let occupied_around = |cells: &[usize]| {
         let mut around: Vec<usize> = cells
@@ -419,7 +444,7 @@ fn surface_of(points: &[Vec3], void: &EnclosedVoid, skeleton: &Skeleton, rough: 
         around.dedup();
         around
     };
-    let touching = occupied_around(&skeleton.main_cells);
+    let touching = occupied_around(main_cells);
     let mut walls = occupied_around(&touching);
     walls.extend(&touching);
     walls.sort_unstable();
@@ -478,8 +503,66 @@ fn covered_range(surface: &[Vec3], refined: &Refined, least_step_m: f64) -> Opti
     (end > start).then_some(((start, end), usual))
 }
 
-fn knots_between(axis: &Axis, (start, end): (f64, f64), radius_m: f64) -> Vec<Vec3> {
-    let count = (((end - start) / radius_m).round() as usize).max(1);
+/// The middle of a void that turns within few widths, so that its sections overlap.
+struct SharpBend {
+    refined: Refined,
+    /// Sum of its turns, degrees.
+    turns_deg: f64,
+    /// Length from portal to portal, metres.
+    length_m: f64,
+}
+
+/// The middle of the void as the axis, if the refined one misses a portal because the tunnel bends too sharply for sections.
+fn sharp_bend(
+    skeleton: &Skeleton,
+    void: &EnclosedVoid,
+    refined: &Refined,
+    radius_m: f64,
+) -> Result<Option<SharpBend>, Error> {
+    let missed = |p: &Vec3| refined.axis.project(p).radius() > MISSED_RADII * radius_m;
+    let samples = (refined.axis.length() / void.grid.cell_m).ceil() as usize;
+    let at = |i: usize| refined.axis.start_chainage() + refined.axis.length() * i as f64 / samples as f64;
+    let in_rock = |i: &usize| {
+        let cell = void.grid.cell_at(&refined.axis.frame_at(at(*i)).origin);
+        cell.is_some_and(|c| void.grid.state(c) == State::Occupied)
+    };
+    let buried = (0..=samples).filter(in_rock).count() as f64;
+    if buried <= MOST_BURIED * samples as f64 && !skeleton.portals(void).iter().any(missed) {
+        return Ok(None);
+    }
+    let way = skeleton.widest_way(void);
+    let mut line = vec![way[0]];
+    for p in &way[1..] {
+        if (p - line[line.len() - 1]).norm() >= 0.5 * void.clearance_m {
+            line.push(*p);
+        }
+    }
+    if line.len() < 3 {
+        return Ok(None);
+    }
+    for _ in 0..SMOOTHING_PASSES {
+        let before = line.clone();
+        for i in 1..line.len() - 1 {
+            line[i] = (before[i - 1] + before[i] * 2.0 + before[i + 1]) / 4.0;
+        }
+    }
+    let length_m: f64 = line.windows(2).map(|w| (w[1] - w[0]).norm()).sum();
+    let turns: f64 = line.windows(3).map(|w| (w[1] - w[0]).angle(&(w[2] - w[1]))).sum();
+    if turns < SHARP_TURN_DEG.to_radians() || length_m > SHARPEST_RADII * radius_m * turns {
+        return Ok(None);
+    }
+    let axis = sections::extended(&line, 1.5 * radius_m)?;
+    let mut gaps: Vec<f64> = way.iter().map(|p| axis.project(p).radius()).collect();
+    let residual_m = median(&mut gaps).unwrap_or(0.0);
+    Ok(Some(SharpBend {
+        refined: Refined { axis, radius_m, wavelength_m: void.clearance_m, residual_m },
+        turns_deg: turns.to_degrees(),
+        length_m,
+    }))
+}
+
+fn knots_between(axis: &Axis, (start, end): (f64, f64), spacing_m: f64) -> Vec<Vec3> {
+    let count = (((end - start) / spacing_m).round() as usize).max(1);
     (0..=count).map(|i| axis.frame_at(start + (end - start) * i as f64 / count as f64).origin).collect()
 }
 
@@ -541,7 +624,7 @@ fn outside_percent(points: &[Vec3], axis: &Axis) -> [f64; 2] {
     ]
 }
 
-fn branches(skeleton: &Skeleton, axis: &Axis) -> Vec<Branch> {
+fn branches(skeleton: &Skeleton, axis: &Axis, radius_m: f64) -> Vec<Branch> {
     let mut found: Vec<Branch> = skeleton
         .branches
         .iter()
@@ -549,6 +632,10 @@ fn branches(skeleton: &Skeleton, axis: &Axis) -> Vec<Branch> {
             let mouth = axis.project(&rough.mouth);
             // What leaves beyond the ends is the outside of a portal.
             if mouth.chainage <= axis.start_chainage() || mouth.chainage >= axis.end_chainage() {
+                return None;
+            }
+            // The axis may run through what the rough path left beside it.
+            if axis.project(&rough.middle).radius() < 0.5 * radius_m {
                 return None;
             }
             let frame = axis.frame_at(mouth.chainage);
@@ -668,6 +755,22 @@ mod tests {
         assert_eq!(summary.branches.len(), 3, "{:?}", summary.branches);
         assert!(summary.warnings.iter().any(|w| w.code == "thin-walls"), "{:?}", summary.warnings);
         assert!(summary.branches.iter().all(|b| b.side == Side::Left));
+    }
+
+    #[test]
+    fn a_tunnel_that_turns_within_two_widths_keeps_its_turn() {
+        // 100 degrees around a bend of one width: no section is seen whole from its middle.
+        let recipe = Recipe {
+            shape: Shape::Circle { radius_m: 2.0 },
+            course: Course::Bend,
+            radius_m: 4.0,
+            length_m: 7.0,
+            points: 40_000,
+            furniture: vec![],
+            ..Recipe::default()
+        };
+        let (length, angle) = length_and_angle(&recipe);
+        assert!((6.3..8.0).contains(&length) && angle < 20.0, "length {length:.2} m, {angle:.1} degrees off");
     }
 
     #[test]

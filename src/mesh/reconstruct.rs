@@ -28,6 +28,8 @@ const SAMPLE: usize = 800_000;
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
     #[default]
+    /// `section`, or `poisson` where much of the surface hides behind itself and that method's surface can be opened.
+    Auto,
     /// Depth over the unrolled mean section: tunnels, drifts, sewers, shafts.
     Section,
     /// Screened Poisson surface, trimmed by its points: caves, junctions, deep overhangs.
@@ -38,8 +40,9 @@ pub enum Method {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// `"section"` for tunnels, drifts, sewers and shafts, `"poisson"` to keep what hides behind itself; the section
-    /// method warns when much does.
+    /// `"section"` for tunnels, drifts, sewers and shafts, `"poisson"` to keep what hides behind itself. `"auto"` takes
+    /// `section` and, where more than 5 % of the rays from the axis meet the surface more than once, `poisson` if its
+    /// surface can be opened with few cuts; the report tells why.
     pub method: Method,
     /// Distance between neighbouring vertices in metres; by default about one vertex for 1.5 points, but not finer than
     /// 1/600 of the tunnel's perimeter.
@@ -63,7 +66,7 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            method: Method::Section,
+            method: Method::Auto,
             spacing_m: None,
             max_gap_m: 0.05,
             fill_hole_m: 0.3,
@@ -151,40 +154,76 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         let reason = "mesh.method = \"poisson\" was set".to_owned();
         return by_poisson(segmentation, axis, settings, &options, reason);
     }
+    let count = |class: Class| segmentation.class.iter().filter(|k| **k == class).count();
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
     let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
     let share = section.multiple_depth_percent;
+    let mut reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
+    let front = count(Class::Furniture);
+    let share_in_front = front as f64 / (points + front) as f64;
+    let hides = share > MANY_DEPTHS_PERCENT || share_in_front > MOSTLY_IN_FRONT;
+    if hides && settings.method == Method::Auto && !segmentation.sampling.is_profiles() {
+        if share_in_front > MOSTLY_IN_FRONT {
+            reason += &format!(", {:.0} % of the points stand in front of the rest", 100.0 * share_in_front);
+        }
+        match by_poisson(segmentation, axis, settings, &options, reason.clone()) {
+            Ok((mesh, summary)) => match cannot_be_opened(&mesh, &summary, axis, segmentation) {
+                None => return Ok((mesh, summary)),
+                Some(why) => reason += &format!("; the surface of the poisson method {why}, so section was kept"),
+            },
+            Err(why) => reason += &format!("; the poisson method found none ({why})"),
+        }
+    }
     let mut warnings = Vec::new();
     if share > MANY_DEPTHS_PERCENT {
         warnings.push(Warning::new(
             "multiple-depths",
             format!(
-                "{share:.1} % of the cells hold points at several distances from the axis; the section method keeps one; \
-                 mesh.method = \"poisson\" keeps all"
+                "the section method keeps one depth for each ray from the axis ({reason}); mesh.method = \"poisson\" keeps all"
             ),
         ));
     }
-    let front = segmentation.class.iter().filter(|c| **c == Class::Furniture).count();
-    if front as f64 > MOSTLY_IN_FRONT * (points + front) as f64 {
+    if share_in_front > MOSTLY_IN_FRONT {
         warnings.push(Warning::new(
             "mostly-in-front",
             format!(
                 "{:.0} % of the points stand in front of the rest and were left out: the tunnel is not understood as a \
                  section that runs along an axis; mesh.method = \"poisson\" keeps them",
-                100.0 * front as f64 / (points + front) as f64
+                100.0 * share_in_front
             ),
         ));
     }
     if !section.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
         warnings.push(openings::warning(&section.openings));
     }
-    let reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
     let (mesh, thinned) = thin(mesh, settings);
     let mut summary = describe("section", reason, &mesh, warnings);
     summary.decimate = thinned;
     summary.openings = section.openings.clone();
     summary.section = Some(section);
     Ok((mesh, summary))
+}
+
+/// Why a surface of the poisson method makes no map, if it does not: cuts through it that are longer in all than its
+/// section, or borders that do not run around the axis like portals.
+fn cannot_be_opened(mesh: &Mesh, summary: &Summary, axis: &Axis, segmentation: &Segmentation) -> Option<String> {
+    let repair = summary.repair.as_ref()?;
+    let most_m = segmentation.section.mean_perimeter();
+    if repair.handles_left > 0 || repair.handle_cuts_m > most_m {
+        return Some(format!(
+            "has {} handles to be cut open over {:.0} m (at most {most_m:.0} m)",
+            repair.handles_cut + repair.handles_left,
+            repair.handle_cuts_m
+        ));
+    }
+    let borders = topology::boundary_loops(mesh.faces(), mesh.twins());
+    let around: Vec<i64> = borders
+        .iter()
+        .map(|border| turns(axis, &border.iter().map(|&v| mesh.vertices()[v as usize]).collect::<Vec<_>>()))
+        .filter(|t| *t != 0)
+        .collect();
+    (around.len() > 2 || around.iter().any(|t| t.abs() > 1))
+        .then(|| format!("has {} borders around the axis that wind {around:?} times", around.len()))
 }
 
 /// The poisson method, cut off at the wall line and repaired.

@@ -1,8 +1,9 @@
 //! Which side of the surface is the void, for rock that hides behind itself: the side that one gets to from the axis.
 //!
 //! Use it where "towards the axis" is no answer: overhangs, pillars, boulders on the floor. Cells with points are walls;
-//! a flood from the axis through cells that are not beside a wall (so that it does not seep through cells that have no
-//! points by chance) and then a few steps closer gives every free cell the number of steps that lead to it. Of the two
+//! a flood from the axis through cells that are not near a wall (so that it does not seep through cells that have no
+//! points by chance, nor into clefts that are narrow beside the tunnel) and then a few steps closer gives every free cell the
+//! number of steps that lead to it. Of the two
 //! cells a little way along and against a normal, the one that is reached, or reached much sooner, lies in the void;
 //! through a hole in the surface the way to the back is long, and the flood neither leaves the portals nor goes on for ever. A point none of whose sides is reached was never seen from
 //! the tunnel (the buried part of a boulder in a model made of pieces) and is told as hidden.
@@ -18,8 +19,8 @@ use rayon::prelude::*;
 /// Edge of a cell in distances between points: a random sample leaves five neighbouring cells of a surface empty in one
 /// of two million places.
 const CELL_IN_SPACINGS: f64 = 1.75;
-/// Steps by which the flood comes closer to the walls in the end.
-const CLOSER: usize = 2;
+/// The flood keeps this share of its longest way off the walls, and a cell at least.
+const OFF_THE_WALL: f64 = 1.0 / 130.0;
 /// Most cells; a larger box gets larger cells.
 const MOST_CELLS: f64 = 3e7;
 /// How far along the normal one looks, in cells, nearest first.
@@ -71,13 +72,19 @@ pub(super) fn face_the_void(
     for cell in walls.iter().filter_map(cell_of) {
         steps[cell] = WALL;
     }
-    let walls: Vec<usize> = (0..steps.len()).filter(|&c| steps[c] == WALL).collect();
-    for cell in walls {
-        for_each_neighbour(cell, dims, |n| {
-            if steps[n] == UNREACHED {
-                steps[n] = BESIDE;
-            }
-        });
+    let mut rim: Vec<usize> = (0..steps.len()).filter(|&c| steps[c] == WALL).collect();
+    let off = ((OFF_THE_WALL * way_m / cell_m).round() as usize).max(1);
+    for _ in 0..off {
+        let mut next = Vec::new();
+        for cell in rim {
+            for_each_neighbour(cell, dims, |n| {
+                if steps[n] == UNREACHED {
+                    steps[n] = BESIDE;
+                    next.push(n);
+                }
+            });
+        }
+        rim = next;
     }
     let centre = |cell: usize| {
         let at = [cell % dims[0], cell / dims[0] % dims[1], cell / (dims[0] * dims[1])];
@@ -95,17 +102,18 @@ pub(super) fn face_the_void(
         !beyond(0, -1.0) && !beyond(1, 1.0)
     };
     let most_steps = (way_m / cell_m).ceil() as u32;
-    flood(&mut steps, dims, axis, cell_m, most_steps, cell_of, inside);
+    flood(&mut steps, dims, axis, cell_m, [most_steps, off as u32 + 1], cell_of, inside);
 
-    let reached = |p: Vec3| cell_of(&p).map(|c| steps[c]).filter(|&s| s < WALL);
     // (turn, hidden, unclear)
     let verdicts: Vec<(bool, bool, bool)> = points
         .par_iter()
         .zip(normals.par_iter())
         .map(|(p, n)| {
             let mut seen = false;
+            let mut sides = [Look::default(), Look::default()];
             for along in LOOK_AT.map(|k| k * cell_m) {
-                let (front, back) = (reached(p + n * along), reached(p - n * along));
+                let front = sides[0].at(cell_of(&(p + n * along)).map(|c| steps[c]));
+                let back = sides[1].at(cell_of(&(p - n * along)).map(|c| steps[c]));
                 seen |= front.is_some() || back.is_some();
                 match (front, back) {
                     (Some(_), None) => return (false, false, false),
@@ -123,13 +131,31 @@ pub(super) fn face_the_void(
     Sides { unclear: verdicts.iter().filter(|v| v.2).count(), hidden: verdicts.into_iter().map(|v| v.1).collect() }
 }
 
-/// Numbers the free cells by their steps from the axis.
+/// A look from a point along or against its normal, which another wall ends.
+#[derive(Default)]
+struct Look {
+    left_own_wall: bool,
+    blocked: bool,
+}
+
+impl Look {
+    /// The steps of the next cell looked at, if the flood came there and no wall is before it.
+    fn at(&mut self, steps: Option<u32>) -> Option<u32> {
+        match steps {
+            Some(WALL) => self.blocked |= self.left_own_wall,
+            _ => self.left_own_wall = true,
+        }
+        steps.filter(|&s| s < WALL && !self.blocked)
+    }
+}
+
+/// Numbers the free cells by their steps from the axis: at most `most_steps` off the walls, then some `closer` to them.
 fn flood(
     steps: &mut [u32],
     dims: [usize; 3],
     axis: &Axis,
     cell_m: f64,
-    most_steps: u32,
+    [most_steps, closer]: [u32; 2],
     cell_of: impl Fn(&Vec3) -> Option<usize>,
     inside: impl Fn(usize) -> bool,
 ) {
@@ -161,7 +187,7 @@ fn flood(
         }
         front = next;
     }
-    for _ in 0..CLOSER {
+    for _ in 0..closer {
         let mut next = Vec::new();
         for &cell in &reached {
             let here = steps[cell as usize];

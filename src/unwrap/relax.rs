@@ -29,18 +29,22 @@
 //! the preconditioner is the surface's own Laplacian, the number of steps does not grow with the mesh, so no coarse
 //! solve is needed: a million faces relax in one go.
 //!
-//! Guarantees: a chart without flips stays without flips; at `straightness` 1, u is exactly the chainage; isometric on
-//! prisms; same bytes on any number of threads. Faces that are flipped at the start (the section chart could not be
-//! unfolded) are pulled towards rigidity without the barrier and counted.
+//! Faces that are flipped at the start (the section chart could not be unfolded: caves, sharp bends) are pulled towards
+//! rigidity without the barrier, and the few that are flipped at the end are unfolded. Where that fails it starts again
+//! from an embedding in a rectangle, which has no flips, unfurled by steps of `slim`.
+//!
+//! Guarantees: no flips below `straightness` 1; there, u is exactly the chainage. Isometric on prisms; same bytes on any
+//! number of threads.
 //! Cost: two factorizations (about 1 s a million faces together) and 0.2 s a step and million faces.
 
 use super::corner_sums::CornerSums;
+use super::finish::finish;
 use super::flip_free_step::largest_flip_free_step;
 use super::guide::Guide;
 use super::quasi_newton::{Memory, advance, chunked_sum, dot};
 use super::rigid_fit::{rigid_density, rigid_slope};
 use super::triangle_shapes::{Shape, Shapes};
-use super::{Error, SolveSummary, distortion};
+use super::{Error, SolveSummary, distortion, slim};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
 use crate::numeric::sparse::{Analysis, Cholesky, Pattern};
@@ -75,6 +79,8 @@ const BEARING_TIE: f64 = 0.25;
 const PLACE_TIE: f64 = 1e-7;
 /// The horizontal tie grows no further beyond this `straightness`: rough rock has no straight axis lines.
 const STRAIGHTEST: f64 = 0.95;
+/// Steps of `slim` that unfurl an embedding in a rectangle before the ties to the axis come in.
+const FIRST_STEPS: usize = 40;
 /// Steps that minimise the rigid energy first: it has no barrier, so needles in the start do not slow it down.
 const RIGID_STEPS: usize = 3;
 /// Share of the way to the first flip that a step may go.
@@ -93,11 +99,35 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     if !(settings.tolerance > 0.0 && settings.tolerance < 1.0) {
         return Err(Error::Setting { key: "relax.tolerance", value: settings.tolerance, must: "between 0 and 1" });
     }
-    let failed = |e: crate::numeric::sparse::Error| Error::Solve { method: "relax", what: e.to_string() };
     let mut summary = SolveSummary::default();
     let shapes = Shapes::of(strip.mesh());
-    let mut uv = guide.uv().to_vec();
-    let problem = Problem::new(strip.mesh(), guide, &shapes, settings, &uv);
+    let mut uv = descend(strip, guide, &shapes, settings, guide.uv().to_vec(), &mut summary)?;
+    if settings.straightness >= 1.0 {
+        summary.figures.insert("repaired_faces".to_owned(), shapes.repaired.len() as f64);
+        summary.warnings.extend(shapes.warning());
+        return Ok((uv, summary));
+    }
+    finish(strip, &shapes, &mut uv, &mut summary);
+    if guide.summary().flipped_faces > 0 && distortion::flipped_faces(strip.mesh(), &uv).0 > 0 {
+        summary = SolveSummary::default();
+        let start = slim::without_flips("relax", strip, guide, &shapes, FIRST_STEPS, &mut summary)?;
+        uv = descend(strip, guide, &shapes, settings, start, &mut summary)?;
+        finish(strip, &shapes, &mut uv, &mut summary);
+    }
+    Ok((uv, summary))
+}
+
+/// The quasi-Newton steps from a start.
+fn descend(
+    strip: &Strip,
+    guide: &Guide,
+    shapes: &Shapes,
+    settings: &Settings,
+    mut uv: Vec<Vec2>,
+    summary: &mut SolveSummary,
+) -> Result<Vec<Vec2>, Error> {
+    let failed = |e: crate::numeric::sparse::Error| Error::Solve { method: "relax", what: e.to_string() };
+    let problem = Problem::new(strip.mesh(), guide, shapes, settings, &uv);
     let step = Preconditioner::new(&problem).map_err(failed)?;
 
     for _ in 0..RIGID_STEPS.min(settings.max_iterations) {
@@ -160,9 +190,7 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     summary.energy = Some(energy);
     summary.figures.insert("straightness".to_owned(), settings.straightness);
     summary.figures.insert("faces_without_barrier".to_owned(), problem.loose_count as f64);
-    summary.figures.insert("repaired_faces".to_owned(), shapes.repaired.len() as f64);
-    summary.warnings.extend(shapes.warning());
-    Ok((uv, summary))
+    Ok(uv)
 }
 
 /// What is minimised.

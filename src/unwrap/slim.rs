@@ -24,7 +24,8 @@
 //! Laplacians. The system is therefore solved by conjugate gradients preconditioned with one factored Laplacian, made once
 //! for all iterations; it never has to be assembled. Where the weights are far from that (after a start by Tutte) and the
 //! iterations do not converge, the form is assembled into its 2x2 block pattern (made once, slots known) and factored;
-//! both are counted in the summary. The proximal weight is 1e-4 of the mean diagonal instead of an absolute 1e-4.
+//! both are counted in the summary. The proximal weight is 1e-4 of the mean diagonal instead of an absolute 1e-4. Weights
+//! end where a face is squeezed a few hundredfold; the gradient is exact all the same.
 //! Cost: one Cholesky factorization of the number of vertices, then about ten solves with it an iteration.
 
 use super::corner_sums::CornerSums;
@@ -48,6 +49,9 @@ use serde::{Deserialize, Serialize};
 const PROXIMAL: f64 = 1e-4;
 /// The linear solve stops at this share of the first residual: the step is searched along a line anyway.
 const SOLVE_SHARE: f64 = 1e-3;
+/// Greatest weight in the form that is solved, that of a face squeezed to 3 thousandths: beyond, its matrix would be singular
+/// within rounding.
+const MOST_WEIGHT: f64 = 4e7;
 /// Conjugate gradient steps before the form is factored instead.
 const MOST_STEPS: usize = 60;
 /// Share of the largest flip-free step that the line search starts from.
@@ -85,6 +89,25 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
         .map_err(|e| Error::Solve { method: "slim", what: e.to_string() })?;
     finish(strip, &shapes, &mut uv, &mut summary);
     Ok((uv, summary))
+}
+
+/// A map without flips after a few iterations, for methods that go on from there.
+pub(super) fn without_flips(
+    method: &'static str,
+    strip: &Strip,
+    guide: &Guide,
+    shapes: &Shapes,
+    max_iterations: usize,
+    summary: &mut SolveSummary,
+) -> Result<Vec<Vec2>, Error> {
+    let mut uv = start_without_flips(method, strip, Some(guide), shapes, summary)?;
+    let mut own = SolveSummary::default();
+    let settings = Settings { max_iterations, ..Settings::default() };
+    minimize(strip.mesh(), shapes, &mut uv, &settings, &mut own)
+        .map_err(|e| Error::Solve { method, what: e.to_string() })?;
+    summary.figures.insert("unfurling_steps".to_owned(), own.iterations as f64);
+    summary.figures.extend(own.figures);
+    Ok(uv)
 }
 
 /// The iterations, from a map without flips.
@@ -139,9 +162,9 @@ fn minimize(
 /// What a face contributes at the current map.
 #[derive(Clone, Copy)]
 struct FaceWeight {
-    /// `Q = W^2`, symmetric: entries 00, 01, 11.
+    /// `Q = W^2`, symmetric: entries 00, 01, 11; its eigenvalues end at [`MOST_WEIGHT`].
     q: [f64; 3],
-    /// `Q (J - R)`, half the derivative of `D` with respect to `J`.
+    /// `Q (J - R)` without that end, half the derivative of `D` with respect to `J`.
     stress: Mat2,
 }
 
@@ -160,11 +183,15 @@ impl FaceWeight {
         let double = h.atan2(e) + g.atan2(f);
         let (sin, cos) = double.sin_cos();
         let (mean, half) = ((w1 + w2) / 2.0, (w1 - w2) / 2.0);
-        let q = [mean + half * cos, half * sin, mean - half * cos];
+        let form = |w1: f64, w2: f64| {
+            let (mean, half) = ((w1 + w2) / 2.0, (w1 - w2) / 2.0);
+            [mean + half * cos, half * sin, mean - half * cos]
+        };
+        let q = form(w1, w2);
         let rotation = if turn > 0.0 { Mat2::new(e, -h, h, e) / turn } else { Mat2::identity() };
         let d = j - rotation;
         let stress = Mat2::new(q[0], q[1], q[1], q[2]) * d;
-        Self { q, stress }
+        Self { q: form(w1.min(MOST_WEIGHT), w2.min(MOST_WEIGHT)), stress }
     }
 }
 

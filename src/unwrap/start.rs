@@ -1,17 +1,22 @@
-//! Where iterative methods start: the guide's section chart, else a conformal map, else Tutte's embedding.
+//! Where iterative methods start: the guide's section chart or a conformal map, else Tutte's embedding.
 
 use super::conformal::{ConformalForm, far_pair, used_vertices};
-use super::distortion::flipped_faces;
 use super::guide::Guide;
 use super::rigid_fit::chart_area;
 use super::triangle_shapes::Shapes;
-use super::unfold::unfold;
+use super::unfold::{Unfolded, unfold};
 use super::{Error, SolveSummary};
 use crate::cut::Strip;
-use crate::numeric::Vec2;
+use crate::mesh::Mesh;
+use crate::numeric::{Vec2, Vec3};
 use crate::numeric::sparse::{self, Cholesky, Pattern};
 use crate::warning::Warning;
 use std::f64::consts::TAU;
+
+/// How far the sides of the rectangle bulge, as a share of their length.
+const BULGE: f64 = 0.02;
+/// Edges count as at least this long, as a share of a typical one.
+const SHORTEST: f64 = 1e-3;
 
 /// The start of a method that bears flips: the section chart, or the pinned conformal map scaled to the surface's area.
 pub(super) fn start(
@@ -42,28 +47,36 @@ pub(super) fn start_without_flips(
 ) -> Result<Vec<Vec2>, Error> {
     let mesh = strip.mesh();
     let mut uv = start(method, strip, guide, shapes, summary)?;
-    let unfolded = unfold(mesh, &mut uv);
+    // The guide's chart was unfolded as far as it goes.
+    let unfolded = match guide {
+        Some(guide) => Unfolded {
+            flipped_before: guide.summary().folded_faces,
+            flipped_after: guide.summary().flipped_faces,
+            moved_vertices: guide.summary().moved_vertices,
+        },
+        None => unfold(mesh, &mut uv),
+    };
     summary.figures.insert("start_flipped_faces".to_owned(), unfolded.flipped_before as f64);
     if unfolded.flipped_after == 0 {
         return Ok(uv);
     }
+    let failed = |e: sparse::Error| Error::Solve { method, what: format!("Tutte's embedding: {e}") };
+    let in_rectangle = guide.map(|guide| in_rectangle(strip, guide)).transpose().map_err(failed)?.flatten();
+    let figure = if in_rectangle.is_some() { "a rectangle" } else { "a disk" };
     summary.warnings.push(Warning::new(
         "started-from-tutte",
         format!(
             "{} faces of the start stay flipped after unfolding ({} before), so {method} starts from Tutte's embedding \
-             in a disk instead and may need more iterations",
+             in {figure} instead",
             unfolded.flipped_after, unfolded.flipped_before
         ),
     ));
-    let uv = tutte(strip, shapes).map_err(|e: sparse::Error| Error::Solve { method, what: e.to_string() })?;
-    match flipped_faces(mesh, &uv) {
-        (0, _) => Ok(uv),
-        (flipped, collapsed) => Err(Error::Solve {
-            method,
-            what: format!(
-                "no start without flips: {flipped} faces are flipped in Tutte's embedding, {collapsed} of them have no area"
-            ),
-        }),
+    uv = in_rectangle.map_or_else(|| tutte(strip, shapes), Ok).map_err(failed)?;
+    // Rounding folds faces that the embedding squeezes to nearly nothing; they are few and lie apart.
+    let still = unfold(mesh, &mut uv).flipped_after;
+    match still {
+        0 => Ok(uv),
+        _ => Err(Error::Solve { method, what: format!("no start without flips: {still} faces are flipped in Tutte's embedding") }),
     }
 }
 
@@ -80,42 +93,105 @@ pub(super) fn pinned_conformal(strip: &Strip, shapes: &Shapes) -> Result<Vec<Vec
     Ok(uv)
 }
 
-/// Tutte's embedding (W. T. Tutte, "How to draw a graph", Proc. London Math. Soc. 13, 1963, doi:10.1112/plms/s3-13.1.743):
-/// the outer loop on a circle of the surface's area by arc length, every other vertex in the mean of its neighbours. Holes
-/// count as filled by one vertex each, so that the graph is that of a disk.
+/// Tutte's embedding in a circle of the surface's area, the outer loop spread on it by arc length.
 pub(super) fn tutte(strip: &Strip, shapes: &Shapes) -> Result<Vec<Vec2>, sparse::Error> {
+    let rim = strip.outer_loop();
+    let radius = (shapes.area() / std::f64::consts::PI).sqrt();
+    let shares = shares_along(strip.mesh(), &(0..=rim.len()).map(|k| rim[k % rim.len()]).collect::<Vec<_>>());
+    let places: Vec<Vec2> =
+        shares.iter().take(rim.len()).map(|t| Vec2::new((TAU * t).cos(), (TAU * t).sin()) * radius).collect();
+    embedded(strip, &places)
+}
+
+/// Tutte's embedding in a rectangle of the tunnel's length and girth: portals on its left and right, the seam above and
+/// below. `None` where the corners of the section chart do not follow each other around the strip.
+fn in_rectangle(strip: &Strip, guide: &Guide) -> Result<Option<Vec<Vec2>>, sparse::Error> {
+    let (uv, rim) = (guide.uv(), strip.outer_loop());
+    let girth = guide.summary().section.mean_girth_m;
+    let angles = guide.angles();
+    let (low, high) = rim.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| {
+        (low.min(uv[v as usize].x), high.max(uv[v as usize].x))
+    });
+    if !(high > low && girth > 0.0) {
+        return Ok(None);
+    }
+    // The corners of the rim, counter-clockwise on the map from the start of the seam's lower border.
+    let sides = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+    let corner = |(along, around): (f64, f64)| -> usize {
+        let score = |k: usize| {
+            let v = rim[k] as usize;
+            along * (2.0 * (uv[v].x - low) / (high - low) - 1.0) + around * angles[v] / std::f64::consts::PI
+        };
+        (0..rim.len()).max_by(|&a, &b| score(a).total_cmp(&score(b)).then(b.cmp(&a))).expect("a rim has vertices")
+    };
+    let corners = sides.map(corner);
+    let lengths: [usize; 4] =
+        std::array::from_fn(|i| (corners[(i + 1) % 4] + rim.len() - corners[i]) % rim.len());
+    if lengths.contains(&0) || lengths.iter().sum::<usize>() != rim.len() {
+        return Ok(None);
+    }
+    let place = |(along, around): (f64, f64)| {
+        Vec2::new(if along > 0.0 { high } else { low }, 0.5 * girth * around)
+    };
+    let mut places = vec![Vec2::zeros(); rim.len()];
+    for i in 0..4 {
+        let side: Vec<u32> = (0..=lengths[i]).map(|k| rim[(corners[i] + k) % rim.len()]).collect();
+        let (from, to) = (place(sides[i]), place(sides[(i + 1) % 4]));
+        let outwards = Vec2::new((to - from).y, -(to - from).x) * (4.0 * BULGE);
+        // A straight side would leave faces with all corners on it without area.
+        for (k, t) in shares_along(strip.mesh(), &side).into_iter().enumerate().take(lengths[i]) {
+            places[(corners[i] + k) % rim.len()] = from + (to - from) * t + outwards * (t * (1.0 - t));
+        }
+    }
+    embedded(strip, &places).map(Some)
+}
+
+/// Where each vertex of a chain lies between its ends, 0 to 1: by length, with a share of plain counting that keeps
+/// doubled vertices apart.
+fn shares_along(mesh: &Mesh, chain: &[u32]) -> Vec<f64> {
+    let steps: Vec<f64> =
+        chain.windows(2).map(|w| (mesh.vertices()[w[0] as usize] - mesh.vertices()[w[1] as usize]).norm()).collect();
+    let total = steps.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+    let mut gone = 0.0;
+    let mut shares = vec![0.0];
+    for (k, step) in steps.iter().enumerate() {
+        gone += step;
+        shares.push(0.9 * gone / total + 0.1 * (k + 1) as f64 / steps.len() as f64);
+    }
+    shares
+}
+
+/// Tutte's embedding (W. T. Tutte, "How to draw a graph", Proc. London Math. Soc. 13, 1963, doi:10.1112/plms/s3-13.1.743)
+/// inside given places of the outer loop, which have to be convex: every other vertex in the mean of its neighbours,
+/// weighted by 1 / edge length. Holes count as filled by one vertex each, so that the graph is that of a disk.
+fn embedded(strip: &Strip, places: &[Vec2]) -> Result<Vec<Vec2>, sparse::Error> {
     let (mesh, rim) = (strip.mesh(), strip.outer_loop());
     let n = mesh.vertices().len();
     let total = n + strip.hole_loops().len();
-    let radius = (shapes.area() / std::f64::consts::PI).sqrt();
     let mut fixed: Vec<Option<Vec2>> = vec![None; total];
-    let length = |k: usize| {
-        let (a, b) = (rim[k] as usize, rim[(k + 1) % rim.len()] as usize);
-        (mesh.vertices()[a] - mesh.vertices()[b]).norm()
-    };
-    // A share of plain counting keeps doubled vertices apart on the circle.
-    let perimeter: f64 = (0..rim.len()).map(length).sum();
-    let mut gone = 0.0;
-    for (k, &v) in rim.iter().enumerate() {
-        let turn = 0.9 * gone / perimeter.max(f64::MIN_POSITIVE) + 0.1 * k as f64 / rim.len() as f64;
-        fixed[v as usize] = Some(Vec2::new((TAU * turn).cos(), (TAU * turn).sin()) * radius);
-        gone += length(k);
-    }
+    rim.iter().zip(places).for_each(|(&v, &p)| fixed[v as usize] = Some(p));
     for (v, used) in used_vertices(n, mesh.faces()).into_iter().enumerate() {
         if !used {
             fixed[v] = Some(Vec2::zeros());
         }
     }
-    let spokes = strip.hole_loops().iter().enumerate();
-    let spokes: Vec<(u32, u32)> = spokes.flat_map(|(h, l)| l.iter().map(move |&v| (v, (n + h) as u32))).collect();
+    let mut points = mesh.vertices().to_vec();
+    let mut spokes = Vec::new();
+    for (h, hole) in strip.hole_loops().iter().enumerate() {
+        points.push(hole.iter().map(|&v| mesh.vertices()[v as usize]).sum::<Vec3>() / hole.len() as f64);
+        spokes.extend(hole.iter().map(|&v| (v, (n + h) as u32)));
+    }
     let edges = || mesh.faces().iter().flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)]).chain(spokes.iter().copied());
     let pattern = Pattern::of_pairs(total, edges)?;
+    // Weights that differ by more than this would be lost in rounding.
+    let shortest_m = SHORTEST * (mesh.area() / mesh.faces().len() as f64).sqrt();
     let mut values = vec![0.0; pattern.entries()];
     for j in 0..total {
         for (k, &i) in pattern.column(j).iter().enumerate().skip(1) {
-            values[pattern.diagonal(j) + k] = -1.0;
-            values[pattern.diagonal(j)] += 1.0;
-            values[pattern.diagonal(i as usize)] += 1.0;
+            let weight = 1.0 / (points[i as usize] - points[j]).norm().max(shortest_m);
+            values[pattern.diagonal(j) + k] = -weight;
+            values[pattern.diagonal(j)] += weight;
+            values[pattern.diagonal(i as usize)] += weight;
         }
     }
     let mut free = values.clone();
@@ -132,6 +208,7 @@ pub(super) fn tutte(strip: &Strip, shapes: &Shapes) -> Result<Vec<Vec2>, sparse:
 #[cfg(test)]
 mod tests {
     use super::super::closed_form;
+    use super::super::distortion::flipped_faces;
     use super::*;
 
     #[test]

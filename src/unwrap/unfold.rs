@@ -8,8 +8,8 @@
 //! draw a graph", Proc. London Math. Soc. 13, 1963, doi:10.1112/plms/s3-13.1.743). Patches are not convex in general,
 //! so the margin grows ring by ring until nothing is flipped or the limit is reached. What is tangled over more than that
 //! is laid anew by `patch_embedding` inside ever wider margins; each patch is taken over only if it has fewer flips then.
-//! Deterministic: vertices move in index order, in place. Cost: linear in the size of the patches, and a sparse
-//! factorisation of those of the second kind.
+//! A chart with more than a fifth of its faces flipped is left as it is. Deterministic: vertices move in index order, in
+//! place. Cost: linear in the size of the patches, and a sparse factorisation of those of the second kind.
 
 use super::distortion::orientation;
 use super::patch_embedding::embed;
@@ -23,6 +23,8 @@ const WIDEST_MARGIN: usize = 12;
 const EMBEDDING_MARGINS: [usize; 4] = [16, 32, 64, 128];
 /// How often both are done.
 const ROUNDS: usize = 2;
+/// Above this share of flipped faces there is no chart to mend: it is left as it is.
+const MOST_FOLDED: f64 = 0.2;
 /// Relaxation sweeps for each margin.
 const SWEEPS: usize = 60;
 
@@ -48,7 +50,7 @@ pub fn unfold(mesh: &Mesh, uv: &mut [Vec2]) -> Unfolded {
     };
     let mut bad = flipped(uv);
     let mut result = Unfolded { flipped_before: bad.len(), flipped_after: bad.len(), moved_vertices: 0 };
-    if bad.is_empty() {
+    if bad.is_empty() || bad.len() as f64 > MOST_FOLDED * faces.len() as f64 {
         return result;
     }
     let around = faces_around(mesh);
