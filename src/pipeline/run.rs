@@ -37,9 +37,9 @@ use std::time::SystemTime;
 /// The stages in their order. Raise a version when the stage gives other results for the same input.
 pub const STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
-    Stage { name: "clean", version: 1, needs: &["ingest"] },
+    Stage { name: "clean", version: 2, needs: &["ingest"] },
     Stage { name: "axis", version: 3, needs: &["clean"] },
-    Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "normals", version: 2, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
