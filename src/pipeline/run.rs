@@ -43,7 +43,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
-    Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
+    Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 4, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
@@ -56,7 +56,7 @@ pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "axis", version: 3, needs: &["ingest"] },
     Stage { name: "mesh", version: 5, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
-    Stage { name: "unwrap", version: 3, needs: &["cut", "axis"] },
+    Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
     Stage { name: "map", version: 3, needs: &["unwrap", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "unwrap", "mesh", "axis"] },
 ];
