@@ -44,7 +44,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "mesh", version: 4, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
-    Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
+    Stage { name: "anchor", version: 3, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 4, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
@@ -329,7 +329,9 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         cleaned.release();
         let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
         tell_ends(&mut summary, cloud.get()?.frame());
-        let quality = points.quality.at(&segmentation.section, &axis, mesh.vertices());
+        let axis: &Axis = &axis;
+        let places: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
+        let quality = points.quality.at(&segmentation.section, &places);
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None, Some(&quality))?;
         let feet = feet(&segmentation);
         let (section, floor) = (segmentation.section.clone(), segmentation.floor.clone());
@@ -360,15 +362,17 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
     });
     let placed = line.product("anchor", |_| {
         let (cloud, chart) = (cloud.get()?, chart.get()?);
+        let chart: &Chart = &chart;
         let mesh = chart.strip().mesh();
-        let (mut anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
-        let index = unwrap::ChartIndex::of(&chart);
-        let covered = unwrap::covered_points(&index, &anchors);
+        let (index, anchoring) = rayon::join(|| unwrap::ChartIndex::of(chart), || anchor::Anchoring::of(mesh));
+        let (mut anchors, summary) = anchoring.anchor(cloud.positions(), &pipeline.anchor);
+        let (covered, round_trip) =
+            unwrap::covered_and_round_trip(&index, &anchors, cloud.positions(), anchoring.normals());
         anchors.release(&covered);
         let mut summary = section(&summary);
         summary["covered"] = json!(covered.len());
         summary["warnings"] = json!(covered_warning(covered.len()));
-        summary["roundtrip"] = json!(unwrap::round_trip(&index, &anchors, cloud.positions()));
+        summary["roundtrip"] = json!(round_trip);
         Ok((PlacedPoints { uv: anchors.in_chart(mesh, chart.uv()), offsets_m: anchors.offsets().to_vec() }, summary))
     });
     let map = line.passing("map", |staging| {
@@ -376,8 +380,7 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         let placed = placed.get()?;
         let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
         let around = around_the_axis(pipeline, &chart, places, &axis, &surface)?;
-        let vertices = chart.strip().mesh().vertices();
-        let quality = surface.points.as_ref().map(|p| p.quality.at(&surface.section, &axis, vertices));
+        let quality = surface.points.as_ref().map(|p| p.quality.at(&surface.section, places));
         let input = map::DrawInput {
             chart: &chart,
             points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),

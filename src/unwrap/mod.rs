@@ -44,7 +44,7 @@ mod independent;
 #[cfg(test)]
 mod robustness;
 
-pub use chart_index::{ChartIndex, RoundTrip, covered_points, round_trip};
+pub use chart_index::{ChartIndex, RoundTrip, covered_and_round_trip, covered_points, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
 pub use handles::Handle;
