@@ -10,6 +10,7 @@
 
 use adit::clean::{StatisticalOutliers, VoxelDownsample, remove_statistical_outliers, voxel_downsample};
 use adit::numeric::Vec3;
+use adit::spatial::nearest::BundleTree;
 use adit::synthetic::{Recipe, scan};
 use adit::{io, normals};
 use std::path::PathBuf;
@@ -87,7 +88,7 @@ fn main() {
     time(
         "statistical_outliers",
         repeat,
-        || remove_statistical_outliers(&points, &outliers),
+        || remove_statistical_outliers(&BundleTree::new(&points), &outliers),
         |v| format!("kept {}, k {neighbours}", v.kept.iter().filter(|k| **k).count()),
     );
     time("normals, fixed", repeat, || normals::unoriented(&points, neighbours), |_| format!("k {neighbours}"));

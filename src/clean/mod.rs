@@ -13,6 +13,7 @@ pub use voxel_downsample::{VoxelDownsample, Voxels, voxel_downsample};
 
 use crate::cloud::Cloud;
 use crate::numeric::Vec3;
+use crate::spatial::nearest::BundleTree;
 use crate::warning::Warning;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -101,6 +102,7 @@ pub enum Error {
 #[derive(Clone, Debug, PartialEq)]
 pub struct GeometryCloud {
     positions: Vec<Vec3>,
+    tree: BundleTree,
     counts: Vec<u32>,
     first_points: Vec<u32>,
     geometry_of_point: Vec<u32>,
@@ -112,7 +114,8 @@ impl GeometryCloud {
     /// A geometry cloud that takes every position as it is: one geometry point per position.
     pub fn from_positions(positions: Vec<Vec3>) -> Self {
         let indices: Vec<u32> = (0..positions.len() as u32).collect();
-        let spacing = Spacing::estimate(&positions);
+        let tree = BundleTree::new(&positions);
+        let spacing = Spacing::estimate_with(&positions, &tree);
         Self {
             counts: vec![1; positions.len()],
             first_points: indices.clone(),
@@ -120,6 +123,7 @@ impl GeometryCloud {
             cell_m: spacing.along_m,
             spacing,
             positions,
+            tree,
         }
     }
 
@@ -136,6 +140,11 @@ impl GeometryCloud {
     /// Means of the scan points per voxel, local metres.
     pub fn positions(&self) -> &[Vec3] {
         &self.positions
+    }
+
+    /// The tree over the positions, for all who look for neighbours.
+    pub fn tree(&self) -> &BundleTree {
+        &self.tree
     }
 
     /// How many scan points went into each geometry point.
@@ -181,7 +190,7 @@ pub fn clean(cloud: &Cloud, settings: &Settings) -> Result<(GeometryCloud, Summa
 
     let mut voxels = voxel_downsample(points, &settings.voxel_downsample);
     let occupied_voxels = voxels.positions.len();
-    let verdict = remove_statistical_outliers(&voxels.positions, &settings.statistical_outliers);
+    let verdict = remove_statistical_outliers(&voxels.tree, &settings.statistical_outliers);
     let outlier_points = voxels.counts.iter().zip(&verdict.kept).filter(|(_, k)| !**k).map(|(c, _)| *c as usize).sum();
     voxels.keep(&verdict.kept);
     if voxels.positions.is_empty() {
@@ -199,7 +208,7 @@ pub fn clean(cloud: &Cloud, settings: &Settings) -> Result<(GeometryCloud, Summa
             ),
         ));
     }
-    let spacing = Spacing::estimate(&voxels.positions);
+    let spacing = Spacing::estimate_with(&voxels.positions, &voxels.tree);
     let summary = Summary {
         points: points.len(),
         exact_duplicates: voxels.exact_duplicates,
@@ -214,8 +223,8 @@ pub fn clean(cloud: &Cloud, settings: &Settings) -> Result<(GeometryCloud, Summa
         spacing,
         warnings,
     };
-    let Voxels { positions, counts, first_points, geometry_of_point, cell_m, .. } = voxels;
-    Ok((GeometryCloud { positions, counts, first_points, geometry_of_point, cell_m, spacing }, summary))
+    let Voxels { positions, counts, first_points, geometry_of_point, cell_m, tree, .. } = voxels;
+    Ok((GeometryCloud { positions, tree, counts, first_points, geometry_of_point, cell_m, spacing }, summary))
 }
 
 #[cfg(test)]

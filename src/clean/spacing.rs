@@ -5,7 +5,7 @@
 //! nearest point more than 60 degrees off that line; else both spacings are the same.
 
 use crate::numeric::{Mat3, Vec3};
-use crate::spatial::KdTree;
+use crate::spatial::nearest::BundleTree;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -43,15 +43,21 @@ impl Spacing {
         self.across_m > ANISOTROPIC_RATIO * self.along_m
     }
 
-    /// Median spacings over a sample of `points`; zero for fewer than two points.
+    /// Median spacings over a sample of finite `points`; zero for fewer than two points.
     pub fn estimate(points: &[Vec3]) -> Self {
+        Self::estimate_with(points, &BundleTree::new(points))
+    }
+
+    /// [`Self::estimate`] with the tree over the points.
+    pub fn estimate_with(points: &[Vec3], tree: &BundleTree) -> Self {
         if points.len() < 2 {
             return Self::even(0.0);
         }
-        let tree = KdTree::new(points);
         let step = points.len().div_ceil(SAMPLES);
+        let sample: Vec<usize> = (0..points.len()).step_by(step).collect();
+        let places = tree.places_of(&sample);
         let samples: Vec<(f64, f64, Option<Vec3>)> =
-            (0..points.len()).into_par_iter().step_by(step).filter_map(|i| around(points, &tree, i)).collect();
+            sample.into_par_iter().zip(places).filter_map(|(i, place)| around(points, tree, i, place)).collect();
         let median = |values: Vec<f64>| crate::numeric::statistics::median(&mut { values }).unwrap_or(0.0);
         let along_m = median(samples.iter().map(|s| s.0).collect());
         let across_m = median(samples.iter().map(|s| s.1).collect());
@@ -69,10 +75,11 @@ impl Spacing {
     }
 }
 
-/// Spacing along and across around point `i`, and the direction of its line if there is one.
-fn around(points: &[Vec3], tree: &KdTree, i: usize) -> Option<(f64, f64, Option<Vec3>)> {
+/// Spacing along and across around point `i`, which has a place in the tree, and the direction of its line if there is
+/// one.
+fn around(points: &[Vec3], tree: &BundleTree, i: usize, place: usize) -> Option<(f64, f64, Option<Vec3>)> {
     let p = points[i];
-    let nearest = tree.nearest_n(&p, LINE_NEIGHBOURS + 1);
+    let nearest = tree.nearest(place, LINE_NEIGHBOURS + 1);
     // Half the distance to the second neighbour: along a line it is the step, on a plane near enough to it.
     let gaps: Vec<f64> = nearest.iter().map(|n| n.distance_squared.sqrt()).filter(|d| *d > 0.0).collect();
     let along = *gaps.first()?;
@@ -89,7 +96,7 @@ fn around(points: &[Vec3], tree: &KdTree, i: usize) -> Option<(f64, f64, Option<
     let line: Vec3 = eigen.eigenvectors.column(first).into_owned();
     let mut count = 4 * LINE_NEIGHBOURS;
     while count <= MOST_NEIGHBOURS {
-        let wider = tree.nearest_n(&p, count);
+        let wider = tree.nearest(place, count);
         for n in &wider {
             let offset = points[n.index as usize] - p;
             // More than 60 degrees off the line, and not just noise beside the point itself.

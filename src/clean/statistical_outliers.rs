@@ -13,7 +13,6 @@
 //! exceeds a large multiple of its median. Cost: k nearest neighbours of every point.
 
 use super::Error;
-use crate::numeric::Vec3;
 use crate::numeric::statistics::median;
 use crate::spatial::nearest::BundleTree;
 use rayon::prelude::*;
@@ -77,15 +76,14 @@ pub struct Verdict {
     pub sparse_limit_m: f64,
 }
 
-/// Judges every point; `points` should be in a spatial order (see [`crate::spatial::VoxelGrid`]) for speed.
-pub fn remove_statistical_outliers(points: &[Vec3], settings: &StatisticalOutliers) -> Verdict {
-    if !settings.enabled || points.len() <= settings.neighbours {
-        return Verdict { kept: vec![true; points.len()], ratio: f64::INFINITY, sparse_limit_m: f64::INFINITY };
+/// Judges every point of the tree.
+pub fn remove_statistical_outliers(tree: &BundleTree, settings: &StatisticalOutliers) -> Verdict {
+    if !settings.enabled || tree.len() <= settings.neighbours {
+        return Verdict { kept: vec![true; tree.len()], ratio: f64::INFINITY, sparse_limit_m: f64::INFINITY };
     }
     let k = settings.neighbours;
     // All along the curve of the tree, where neighbours are near in memory. The point itself is its own nearest
     // neighbour.
-    let tree = BundleTree::new(points);
     let found: Vec<(f32, [u32; MOST_NEIGHBOURS])> = tree.for_each_place(k + 1, |place, neighbours| {
         let mut sum = 0.0;
         let mut others = [0; MOST_NEIGHBOURS];
@@ -100,20 +98,26 @@ pub fn remove_statistical_outliers(points: &[Vec3], settings: &StatisticalOutlie
     let logs: Vec<f64> = found
         .par_iter()
         .map(|(own_distance, neighbours)| {
-            let mut theirs = [0.0f32; MOST_NEIGHBOURS];
+            // Distances sort like their bits, and those sort faster.
+            let mut theirs = [0u32; MOST_NEIGHBOURS];
             for (distance, &n) in theirs.iter_mut().zip(&neighbours[..k]) {
-                *distance = own[n as usize];
+                *distance = own[n as usize].to_bits();
             }
-            theirs[..k].sort_unstable_by(f32::total_cmp);
-            let typical = 0.5 * (f64::from(theirs[(k - 1) / 2]) + f64::from(theirs[k / 2]));
+            theirs[..k].sort_unstable();
+            let at = |rank: usize| f64::from(f32::from_bits(theirs[rank]));
+            let typical = 0.5 * (at((k - 1) / 2) + at(k / 2));
             let own_distance = f64::from(*own_distance);
             if own_distance <= typical { 0.0 } else { (own_distance / typical).ln() }
         })
         .collect();
-    let ratio = limit(&logs).clamp(settings.min_ratio, settings.max_ratio);
+    let (ratio, sparse_limit_m) = rayon::join(
+        || limit(&logs).clamp(settings.min_ratio, settings.max_ratio),
+        || {
+            let mut distances: Vec<f64> = own.iter().map(|&d| f64::from(d)).collect();
+            SPARSE_RATIO * median(&mut distances).unwrap_or(f64::INFINITY)
+        },
+    );
     let log_limit = ratio.ln();
-    let mut distances: Vec<f64> = own.par_iter().map(|&d| f64::from(d)).collect();
-    let sparse_limit_m = SPARSE_RATIO * median(&mut distances).unwrap_or(f64::INFINITY);
     let is_kept = |(log, own): (&f64, &f32)| *log <= log_limit && f64::from(*own) <= sparse_limit_m;
     let kept = tree.in_point_order(logs.par_iter().zip(&own).map(is_kept).collect());
     Verdict { kept, ratio, sparse_limit_m }
@@ -128,6 +132,7 @@ fn limit(logs: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::numeric::Vec3;
     use rand::{Rng, SeedableRng};
 
     #[test]
@@ -145,7 +150,7 @@ mod tests {
         for i in 0..20 {
             points.push(Vec3::new(i as f64, 2.0, 1.5));
         }
-        let verdict = remove_statistical_outliers(&points, &StatisticalOutliers::default());
+        let verdict = remove_statistical_outliers(&BundleTree::new(&points), &StatisticalOutliers::default());
         let lost = verdict.kept[..wall].iter().filter(|k| !**k).count();
         assert!(lost < wall / 500, "{lost} of {wall} lost at ratio {}", verdict.ratio);
         let near = verdict.kept[wall..wall + 10].iter().filter(|k| **k).count();
@@ -156,7 +161,7 @@ mod tests {
     fn switched_off_keeps_all() {
         let points: Vec<Vec3> = (0..100).map(|i| Vec3::new(if i == 99 { 1e4 } else { i as f64 }, 0.0, 0.0)).collect();
         let off = StatisticalOutliers { enabled: false, ..Default::default() };
-        assert!(remove_statistical_outliers(&points, &off).kept.iter().all(|k| *k));
-        assert!(!remove_statistical_outliers(&points, &StatisticalOutliers::default()).kept[99]);
+        assert!(remove_statistical_outliers(&BundleTree::new(&points), &off).kept.iter().all(|k| *k));
+        assert!(!remove_statistical_outliers(&BundleTree::new(&points), &StatisticalOutliers::default()).kept[99]);
     }
 }

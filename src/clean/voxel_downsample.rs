@@ -10,6 +10,7 @@
 
 use super::{DROPPED, Error, Spacing};
 use crate::numeric::Vec3;
+use crate::spatial::nearest::BundleTree;
 use crate::spatial::voxel_grid::{VoxelGrid, bounds};
 use rayon::prelude::*;
 use schemars::JsonSchema;
@@ -68,6 +69,8 @@ pub struct Voxels {
     pub exact_duplicates: usize,
     /// Edge of a voxel, metres.
     pub cell_m: f64,
+    /// The tree over `positions`; its places are the voxels.
+    pub tree: BundleTree,
 }
 
 impl Voxels {
@@ -86,6 +89,7 @@ impl Voxels {
         }
         self.geometry_of_point.par_iter_mut().for_each(|v| *v = renumbered[*v as usize]);
         retain(&mut self.positions, kept);
+        self.tree = BundleTree::of_ordered(&self.positions);
         retain(&mut self.counts, kept);
         retain(&mut self.first_points, kept);
     }
@@ -102,7 +106,7 @@ pub fn voxel_downsample(points: &[Vec3], settings: &VoxelDownsample) -> Voxels {
         return average(points, cell_m);
     }
     let voxels = average(points, choose_edge(points, settings.max_points));
-    let profile_edge = Spacing::estimate(&voxels.positions).across_m / EDGES_BETWEEN_PROFILES;
+    let profile_edge = Spacing::estimate_with(&voxels.positions, &voxels.tree).across_m / EDGES_BETWEEN_PROFILES;
     if profile_edge > voxels.cell_m { average(points, profile_edge) } else { voxels }
 }
 
@@ -119,19 +123,29 @@ fn average(points: &[Vec3], cell_m: f64) -> Voxels {
             (first + sum / members.len() as f64, members.len() as u32, members[0], duplicates(points, members))
         })
         .collect();
-    let mut geometry_of_point = vec![0; points.len()];
-    for cell in 0..grid.len() {
-        for &i in grid.points_of(cell) {
-            geometry_of_point[i as usize] = cell as u32;
+    let voxel_of_points = || {
+        let mut voxel_of_points = vec![0; points.len()];
+        for cell in 0..grid.len() {
+            for &i in grid.points_of(cell) {
+                voxel_of_points[i as usize] = cell as u32;
+            }
         }
-    }
+        voxel_of_points
+    };
+    // The scattered writes keep one thread busy.
+    let (geometry_of_point, (positions, tree)) = rayon::join(voxel_of_points, || {
+        let positions: Vec<Vec3> = cells.par_iter().map(|c| c.0).collect();
+        let tree = BundleTree::of_ordered(&positions);
+        (positions, tree)
+    });
     Voxels {
-        positions: cells.par_iter().map(|c| c.0).collect(),
+        positions,
         counts: cells.par_iter().map(|c| c.1).collect(),
         first_points: cells.par_iter().map(|c| c.2).collect(),
         exact_duplicates: cells.iter().map(|c| c.3 as usize).sum(),
         geometry_of_point,
         cell_m: grid.cell_m(),
+        tree,
     }
 }
 
@@ -162,6 +176,12 @@ fn choose_edge(points: &[Vec3], max_points: usize) -> f64 {
     coarse.exp()
 }
 
+/// The largest whole number that is not above `value`, as `floor` finds it but without a call.
+fn whole_below(value: f64) -> i64 {
+    let towards_zero = value as i64;
+    towards_zero.wrapping_sub(i64::from(towards_zero as f64 > value))
+}
+
 /// Occupied voxels per point. In large clouds only the voxels of one in sixteen hash values are counted, with their
 /// points.
 fn occupied_share(points: &[Vec3], cell_m: f64) -> f64 {
@@ -169,7 +189,7 @@ fn occupied_share(points: &[Vec3], cell_m: f64) -> f64 {
     let mut picked: Vec<u64> = points
         .par_iter()
         .filter_map(|p| {
-            let [x, y, z]: [i64; 3] = p.map(|c| (c / cell_m).floor() as i64).into();
+            let [x, y, z]: [i64; 3] = p.map(|c| whole_below(c / cell_m)).into();
             let mixed = x.wrapping_mul(0x9E37_79B9_7F4A_7C15_u64 as i64)
                 ^ y.wrapping_mul(0xC2B2_AE3D_27D4_EB4F_u64 as i64)
                 ^ z.wrapping_mul(0x1656_67B1_9E37_79F9);
@@ -188,6 +208,14 @@ fn occupied_share(points: &[Vec3], cell_m: f64) -> f64 {
 mod tests {
     use super::*;
     use rand::{Rng, SeedableRng};
+
+    #[test]
+    fn cells_are_counted_as_floor_counts_them() {
+        for value in [0.0, -0.0, 0.5, -0.5, 3.0, -3.0, -3.000_000_1, 2.999_999_9, 1e15 + 0.5, -1e15 - 0.5, 1e300, -1e17]
+        {
+            assert_eq!(whole_below(value), f64::floor(value) as i64, "{value}");
+        }
+    }
 
     #[test]
     fn means_are_means() {

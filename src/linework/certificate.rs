@@ -8,7 +8,8 @@
 //! Pixels and segments are spread evenly over the map, the same ones each time. Points are measured by
 //! [`crate::unwrap::round_trip`]. Cost: bounded by the number of samples, however large the map is.
 
-use super::{Feature, FlattenSettings, Kind, drape, flatten};
+use super::drape::drape_with;
+use super::{Feature, FlattenSettings, Kind, flatten};
 use crate::mesh::anchor::Anchoring;
 use crate::numeric::{Vec2, Vec3, statistics};
 use crate::unwrap::ChartIndex;
@@ -134,14 +135,15 @@ fn lines(index: &ChartIndex, anchoring: &Anchoring, (low, high): (Vec2, Vec2), s
         .collect();
     let mut trip = LineTrip::default();
     let mut errors = Vec::new();
-    let Ok(up) = drape(index, &drawn) else { return trip };
+    let normals = anchoring.normals();
+    let Ok(up) = drape_with(index, normals, &drawn) else { return trip };
     for feature in &up.features {
         // Pieces one by one: where a line was split, the pieces have nothing to do with each other.
         for part in &feature.parts {
             trip.sent += 1;
             let one = feature.with_parts(vec![part.clone()]);
             let flat = flatten(index, anchoring, &[one], settings);
-            let again = flat.ok().and_then(|flat| drape(index, &flat.features).ok());
+            let again = flat.ok().and_then(|flat| drape_with(index, normals, &flat.features).ok());
             let Some(back) = again.filter(|a| !a.features.is_empty()) else {
                 trip.lost += 1;
                 continue;

@@ -58,8 +58,12 @@ struct Lifted {
 /// # Errors
 /// [`Error::NotFinite`], [`Error::OffSurface`].
 pub fn drape(index: &ChartIndex, features: &[Feature]) -> Result<Drape, Error> {
-    let mesh = index.chart().strip().mesh();
-    let surface = Surface { index, normals: mesh.vertex_normals() };
+    drape_with(index, &index.chart().strip().mesh().vertex_normals(), features)
+}
+
+/// [`drape`] with the vertex normals of the mesh, for those who drape often.
+pub(super) fn drape_with(index: &ChartIndex, normals: &[Vec3], features: &[Feature]) -> Result<Drape, Error> {
+    let surface = Surface { index, normals };
     let mut summary = DrapeSummary { features: features.len(), ..DrapeSummary::default() };
     let (mut draped, mut sources) = (Vec::new(), Vec::new());
     for (source, feature) in features.iter().enumerate() {
@@ -113,12 +117,12 @@ pub fn drape(index: &ChartIndex, features: &[Feature]) -> Result<Drape, Error> {
 
 struct Surface<'a> {
     index: &'a ChartIndex<'a>,
-    normals: Vec<Vec3>,
+    normals: &'a [Vec3],
 }
 
 impl Surface<'_> {
     fn at(&self, point: SurfacePoint) -> Vec3 {
-        point.position(self.index.chart().strip().mesh(), &self.normals)
+        point.position(self.index.chart().strip().mesh(), self.normals)
     }
 
     fn lifted(&self, p: &Vec3, way: Option<Vec3>) -> Lifted {

@@ -59,6 +59,8 @@ const CHUNK: usize = 4096;
 const MOST_STEPS: usize = 24;
 /// Newton steps for the height.
 const MOST_NEWTON: usize = 12;
+/// A step of the height this small, metres, is the last: what the next one would change is lost in rounding.
+const LAST_STEP: f64 = 1e-10;
 /// A point this little outside a prism (barycentric) is inside: rounding on shared sides.
 const INSIDE: f64 = -1e-9;
 
@@ -278,7 +280,8 @@ impl<'a> Anchoring<'a> {
                 return None;
             }
             h -= step;
-            if step.abs() <= 1e-15 * (1.0 + h.abs()) {
+            // Newton's method squares what is left.
+            if step.abs() <= LAST_STEP * (1.0 + h.abs()) {
                 break;
             }
         }

@@ -20,6 +20,8 @@ pub struct FaceTree {
     first_leaf: usize,
     /// First face of each leaf in `faces`.
     leaf_start: Vec<u32>,
+    /// The leaf of each face.
+    leaf_of: Vec<u32>,
 }
 
 /// The closest point of a surface.
@@ -31,6 +33,15 @@ pub struct Nearest {
     pub barycentric: [f64; 3],
     /// Squared distance, square metres.
     pub squared_distance: f64,
+}
+
+/// Nodes still to be looked at, with their distances: a perfect tree is at most 32 deep.
+struct Stack([(usize, f64); 64]);
+
+impl Default for Stack {
+    fn default() -> Self {
+        Self([(0, 0.0); 64])
+    }
 }
 
 impl FaceTree {
@@ -71,8 +82,10 @@ impl FaceTree {
         split(&mut faces, leaves, 0, count, leaves, &centres);
         let empty = [Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY)];
         let mut boxes = vec![empty; first_leaf + leaves];
+        let mut leaf_of = vec![0u32; count];
         for l in 0..leaves {
             for &f in &faces[leaf_start[l] as usize..leaf_start[l + 1] as usize] {
+                leaf_of[f as usize] = l as u32;
                 for p in mesh.corners(f) {
                     let b = &mut boxes[first_leaf + l];
                     *b = [b[0].inf(&p), b[1].sup(&p)];
@@ -83,27 +96,38 @@ impl FaceTree {
             let (a, b) = (boxes[2 * i + 1], boxes[2 * i + 2]);
             boxes[i] = [a[0].inf(&b[0]), a[1].sup(&b[1])];
         }
-        Self { boxes, faces, first_leaf, leaf_start }
+        Self { boxes, faces, first_leaf, leaf_start, leaf_of }
     }
 
     /// The nearest face within `reach` metres; `guess` is looked at first and makes the search faster when it is near.
     pub fn nearest(&self, mesh: &Mesh, point: &Vec3, reach: f64, guess: Option<FaceId>) -> Option<Nearest> {
         let mut best = Nearest { face: FaceId::MAX, barycentric: [0.0; 3], squared_distance: reach * reach };
-        let consider = |face: FaceId, best: &mut Nearest| {
-            let (barycentric, squared_distance) = closest_on_triangle(&mesh.corners(face), point);
-            if squared_distance < best.squared_distance
-                || (squared_distance == best.squared_distance && face < best.face)
-            {
-                *best = Nearest { face, barycentric, squared_distance };
+        let mut stack = Stack::default();
+        match guess {
+            None => self.look_below(0, mesh, point, &mut best, &mut stack),
+            Some(face) => {
+                consider(mesh, point, face, &mut best);
+                // From the leaf of the guess to the root: mostly no neighbour on the way is near enough to be entered.
+                let mut node = self.first_leaf + self.leaf_of[face as usize] as usize;
+                self.look_below(node, mesh, point, &mut best, &mut stack);
+                while node > 0 {
+                    let sibling = if node % 2 == 1 { node + 1 } else { node - 1 };
+                    self.look_below(sibling, mesh, point, &mut best, &mut stack);
+                    node = (node - 1) / 2;
+                }
             }
-        };
-        if let Some(face) = guess {
-            consider(face, &mut best);
         }
-        // Depth first, the nearer child first; a perfect tree is at most 32 deep.
-        let mut stack = [(0usize, 0.0f64); 64];
+        (best.face != FaceId::MAX).then_some(best)
+    }
+
+    /// Improves the best by the faces below a node: depth first, the nearer child first.
+    fn look_below(&self, node: usize, mesh: &Mesh, point: &Vec3, best: &mut Nearest, Stack(stack): &mut Stack) {
+        let distance = self.squared_distance(node, point);
+        if distance > best.squared_distance {
+            return;
+        }
         let mut top = 1;
-        stack[0] = (0, self.squared_distance(0, point));
+        stack[0] = (node, distance);
         while top > 0 {
             top -= 1;
             let (node, distance) = stack[top];
@@ -113,7 +137,7 @@ impl FaceTree {
             if node >= self.first_leaf {
                 let l = node - self.first_leaf;
                 for &f in &self.faces[self.leaf_start[l] as usize..self.leaf_start[l + 1] as usize] {
-                    consider(f, &mut best);
+                    consider(mesh, point, f, best);
                 }
                 continue;
             }
@@ -127,7 +151,6 @@ impl FaceTree {
                 }
             }
         }
-        (best.face != FaceId::MAX).then_some(best)
     }
 
     fn squared_distance(&self, node: usize, p: &Vec3) -> f64 {
@@ -138,6 +161,14 @@ impl FaceTree {
             sum += d * d;
         }
         sum
+    }
+}
+
+/// Makes a face the best if it is nearer, or as near and of a lower number.
+fn consider(mesh: &Mesh, point: &Vec3, face: FaceId, best: &mut Nearest) {
+    let (barycentric, squared_distance) = closest_on_triangle(&mesh.corners(face), point);
+    if squared_distance < best.squared_distance || (squared_distance == best.squared_distance && face < best.face) {
+        *best = Nearest { face, barycentric, squared_distance };
     }
 }
 

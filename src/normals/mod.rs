@@ -233,19 +233,29 @@ pub fn estimate(
     let estimates = if profiles {
         profiles::estimate(points, axis, &geometry.spacing(), settings.neighbours)
     } else {
-        planes(points, settings.neighbours)
+        planes(geometry.tree(), settings.neighbours)
     };
     let mut normals: Vec<Vec3> = estimates.par_iter().map(|e| e.normal).collect();
     let viewpoints = if settings.use_stations { viewpoints } else { Viewpoints::unknown() };
-    let verdict =
-        orientation::orient(&mut normals, points, axis, |i| viewpoints.of_point(geometry.first_points()[i] as usize));
-
-    let mut used: std::collections::BTreeMap<usize, usize> = std::collections::BTreeMap::new();
-    for e in &estimates {
-        *used.entry(e.neighbours as usize).or_default() += 1;
-    }
-    let mut noises: Vec<f64> = estimates.iter().map(|e| f64::from(e.noise_m)).collect();
-    let on_a_line = estimates.iter().filter(|e| e.on_a_line).count();
+    let station_of = |i: usize| viewpoints.of_point(geometry.first_points()[i] as usize);
+    let (verdict, ((used, on_a_line), (noise_m, noise_p95_m))) = rayon::join(
+        || orientation::orient(&mut normals, points, geometry.tree(), axis, station_of),
+        || {
+            rayon::join(
+                || {
+                    let mut used: std::collections::BTreeMap<usize, usize> = std::collections::BTreeMap::new();
+                    for e in &estimates {
+                        *used.entry(e.neighbours as usize).or_default() += 1;
+                    }
+                    (used, estimates.iter().filter(|e| e.on_a_line).count())
+                },
+                || {
+                    let mut noises: Vec<f64> = estimates.iter().map(|e| f64::from(e.noise_m)).collect();
+                    (median(&mut noises).unwrap_or(0.0), quantile(&mut noises, 0.95).unwrap_or(0.0))
+                },
+            )
+        },
+    );
     let mut warnings = Vec::new();
     if on_a_line * 20 > points.len() {
         warnings.push(Warning::new(
@@ -261,8 +271,8 @@ pub fn estimate(
         points: points.len(),
         profiles,
         neighbourhoods: used.into_iter().map(|(k, n)| [k, n]).collect(),
-        noise_m: median(&mut noises).unwrap_or(0.0),
-        noise_p95_m: quantile(&mut noises, 0.95).unwrap_or(0.0),
+        noise_m,
+        noise_p95_m,
         on_a_line,
         oriented_by_station: verdict.by_station,
         oriented_by_neighbours: verdict.by_neighbours,
@@ -297,11 +307,10 @@ fn normals_of_sizes(tree: &BundleTree, sizes: &[usize]) -> Vec<Vec3> {
     tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], normal))
 }
 
-fn planes(points: &[Vec3], neighbours: Option<usize>) -> Vec<Estimate> {
-    let tree = BundleTree::new(points);
-    let sizes = neighbours.map_or_else(|| neighbourhoods(&tree).to_vec(), |k| vec![k]);
+fn planes(tree: &BundleTree, neighbours: Option<usize>) -> Vec<Estimate> {
+    let sizes = neighbours.map_or_else(|| neighbourhoods(tree).to_vec(), |k| vec![k]);
     let estimate =
-        |place: usize, found: &[Neighbour]| from_plane(tree.point(place), plane_of(&tree, place, found, &sizes));
+        |place: usize, found: &[Neighbour]| from_plane(tree.point(place), plane_of(tree, place, found, &sizes));
     tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], estimate))
 }
 

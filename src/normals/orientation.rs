@@ -6,7 +6,7 @@
 
 use crate::axis::Axis;
 use crate::numeric::Vec3;
-use crate::spatial::KdTree;
+use crate::spatial::nearest::BundleTree;
 use rayon::prelude::*;
 
 /// Cosine between normal and direction to the void below which neighbours decide.
@@ -23,10 +23,11 @@ pub(super) struct Verdict {
     pub by_neighbours: usize,
 }
 
-/// Turns `normals` towards the void.
+/// Turns `normals` towards the void; `tree` is over the points.
 pub(super) fn orient(
     normals: &mut [Vec3],
     points: &[Vec3],
+    tree: &BundleTree,
     axis: &Axis,
     station_of: impl Fn(usize) -> Option<Vec3> + Sync,
 ) -> Verdict {
@@ -64,10 +65,12 @@ pub(super) fn orient(
     if unclear.is_empty() {
         return Verdict { by_station, by_neighbours: 0 };
     }
-    let tree = KdTree::new(points);
     let voters: Vec<Vec<u32>> = unclear
         .par_iter()
-        .map(|&i| tree.nearest_n(&points[i], VOTERS + 1).iter().map(|n| n.index).filter(|&n| n as usize != i).collect())
+        .zip(tree.places_of(&unclear))
+        .map(|(&i, place)| {
+            tree.nearest(place, VOTERS + 1).iter().map(|n| n.index).filter(|&n| n as usize != i).collect()
+        })
         .collect();
     let mut decided: Vec<bool> = clear.iter().map(|c| c.0).collect();
     for _ in 0..ROUNDS {

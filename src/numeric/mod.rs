@@ -3,6 +3,7 @@
 //! Everything is `f64`. Sums run in index order, so a result has the same bytes on any number of threads.
 
 pub mod conjugate_gradients;
+pub mod dissection;
 pub mod sparse;
 pub mod statistics;
 pub mod svd2x2;

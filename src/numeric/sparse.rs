@@ -3,7 +3,7 @@
 //!
 //! A [`Pattern`] is built once from the faces of a mesh (no triplets, so no triplet peak) and tells each face where its
 //! entries go ([`Pattern::face_slots`]). Values are a plain vector beside it, real or complex ([`Entry`]), so an iteration only refills numbers.
-//! [`Analysis`] (fill-reducing AMD ordering and symbolic factorization) is made once a pattern, [`Cholesky`] once a set
+//! [`Analysis`] (fill-reducing ordering, AMD or a given one, and symbolic factorization) is made once a pattern, [`Cholesky`] once a set
 //! of values. Everything runs in one fixed order on the calling thread: same values, same bytes.
 //!
 //! Nothing is regularized behind the caller's back: a matrix that is not positive definite is
@@ -408,12 +408,22 @@ impl Analysis {
             .map_err(|_| no_memory())?;
         drop(memory);
         let pairs: Vec<u32> = forward.iter().flat_map(|&p| [2 * p, 2 * p + 1]).collect();
-        let order = pattern.postordered(&pairs);
+        Self::in_order(pattern, &pairs)
+    }
+
+    /// Analyses a pattern whose unknowns are eliminated in a given order, or in one with the same fill. Panics unless
+    /// every unknown comes once.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`].
+    pub fn in_order(pattern: &Pattern, order: &[u32]) -> Result<Self, Error> {
+        let unknowns = pattern.unknowns();
+        let order = pattern.postordered(order);
         let mut place = vec![0u32; unknowns];
         order.iter().enumerate().for_each(|(k, &i)| place[i as usize] = k as u32);
         let ordering = SymmetricOrdering::Custom(PermRef::new_checked(&order, &place, unknowns));
         let symbolic = factorize_symbolic_cholesky(pattern.as_faer(), Side::Lower, ordering, Default::default())
-            .map_err(|_| no_memory())?;
+            .map_err(|_| Error::OutOfMemory { unknowns })?;
         Ok(Self { symbolic: Arc::new(symbolic) })
     }
 

@@ -6,12 +6,12 @@
 
 use super::checkpoint::{self, Checkpoint};
 use super::error::{Error, StageError};
-use super::run_folder::{Record, RunFolder, sha256_of_bytes};
+use super::run_folder::{ProductFile, Record, RunFolder, sha256_of_bytes};
 use crate::warning::Warning;
 use serde::Serialize;
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::time::Instant;
 
@@ -135,7 +135,80 @@ impl<'a> Line<'a> {
     ) -> Product<'a, T> {
         Product { line: self, stage, value: RefCell::new(None), make: Box::new(make), keep: None }
     }
+
+    /// Runs two stages that leave nothing but files at the same time, for those that do not keep all threads busy. The
+    /// time that both took is divided in the ratio of what each took. One that succeeds is finished even if the other
+    /// fails.
+    pub(super) fn side_by_side(&self, works: [(&'static str, Work); 2]) -> Result<(), Error> {
+        let begun = Instant::now();
+        let folder = self.folder;
+        let [first, second] = works.map(|(stage, work)| (stage, work, self.begin(stage)));
+        let run = |(stage, work, staging): (&'static str, Work, Result<PathBuf, Error>)| {
+            let begun = Instant::now();
+            let done = staging.and_then(|staging| {
+                let ((), summary) = work(&staging)?;
+                Ok((folder.publish(&staging)?, summary))
+            });
+            (stage, done, begun.elapsed().as_secs_f64())
+        };
+        let (first, second) = rayon::join(|| run(first), || run(second));
+        let wall_per_second = begun.elapsed().as_secs_f64() / (first.2 + second.2).max(f64::MIN_POSITIVE);
+        [first, second]
+            .into_iter()
+            .map(|(stage, done, seconds)| {
+                let (files, summary) = done?;
+                self.end(stage, files, summary, seconds * wall_per_second)
+            })
+            // All of them, and then the first error.
+            .fold(Ok(()), Result::and)
+    }
+
+    /// Makes the staging folder of a stage that begins to work.
+    fn begin(&self, stage: &'static str) -> Result<PathBuf, Error> {
+        if !self.is_fresh(stage) {
+            self.worked.set(true);
+            // From here on the folder is on its way to another state: an old verdict would lie about it.
+            self.folder.forget("report")?;
+            self.folder.forget(stage)?;
+            self.folder.remove("report.json")?;
+        }
+        let staging = self.folder.staging(stage)?;
+        self.folder.note("stage-begun", serde_json::json!({ "stage": stage }))?;
+        self.observer.started(stage);
+        Ok(staging)
+    }
+
+    /// Records a stage whose files are in place.
+    fn end(
+        &self,
+        stage: &'static str,
+        files: Vec<ProductFile>,
+        summary: serde_json::Value,
+        seconds: f64,
+    ) -> Result<(), Error> {
+        for warning in warnings_of(&summary) {
+            self.observer.warned(stage, &warning);
+        }
+        let plan = self.plan(stage);
+        let record = Record {
+            key: plan.key.clone(),
+            version: plan.stage.version,
+            settings: plan.settings.clone(),
+            inputs: plan.inputs.clone(),
+            files,
+            summary,
+            seconds,
+            peak_memory_bytes: peak_memory_bytes(),
+        };
+        self.folder.finish(stage, &record)?;
+        self.records.borrow_mut().insert(stage, record);
+        self.observer.finished(stage, seconds, false);
+        Ok(self.folder.note("stage-finished", serde_json::json!({ "stage": stage, "again": false }))?)
+    }
 }
+
+/// What one of two stages side by side does in its staging folder; it tells its section of the report.
+pub(super) type Work<'w> = &'w (dyn Fn(&Path) -> Result<((), serde_json::Value), Error> + Sync);
 
 type Make<'a, T> = Box<dyn Fn(&Path) -> Result<(T, serde_json::Value), Error> + 'a>;
 type Keep<T> = (fn(&T, &mut checkpoint::Writer), fn(&checkpoint::Reader) -> Result<T, checkpoint::Error>);
@@ -195,53 +268,29 @@ impl<T> Product<'_, T> {
             line.nested_seconds.set(nested_before + begun.elapsed().as_secs_f64());
             return Ok(value);
         }
-        if !fresh {
-            line.worked.set(true);
-            // From here on the folder is on its way to another state: an old verdict would lie about it.
-            line.folder.forget("report")?;
-            line.folder.forget(self.stage)?;
-            line.folder.remove("report.json")?;
-        }
-        let staging = line.folder.staging(self.stage)?;
-        line.folder.note("stage-begun", serde_json::json!({ "stage": self.stage }))?;
-        line.observer.started(self.stage);
+        let staging = line.begin(self.stage)?;
         let (value, summary) = (self.make)(&staging)?;
-        if !fresh {
-            if let Some((save, _)) = self.keep {
-                let mut columns = checkpoint::Writer::default();
-                save(&value, &mut columns);
-                let temporary = staging.join("checkpoint");
-                let failed = Error::in_stage::<checkpoint::Error>(self.stage);
-                columns.write(&temporary).map_err(&failed)?;
-                let place = line.folder.checkpoint(self.stage);
-                std::fs::rename(&temporary, &place)
-                    .map_err(|source| failed(checkpoint::Error::Io { path: place.clone(), source }))?;
-            }
-            let files = line.folder.publish(&staging)?;
-            for warning in warnings_of(&summary) {
-                line.observer.warned(self.stage, &warning);
-            }
-            let seconds = begun.elapsed().as_secs_f64() - line.nested_seconds.get();
-            let plan = line.plan(self.stage);
-            let record = Record {
-                key: plan.key.clone(),
-                version: plan.stage.version,
-                settings: plan.settings.clone(),
-                inputs: plan.inputs.clone(),
-                files,
-                summary,
-                seconds,
-                peak_memory_bytes: peak_memory_bytes(),
-            };
-            line.folder.finish(self.stage, &record)?;
-            line.records.borrow_mut().insert(self.stage, record);
-            line.observer.finished(self.stage, seconds, false);
-        }
         if fresh {
             // Its products are in place already.
             line.folder.discard(&staging)?;
+            line.folder.note("stage-finished", serde_json::json!({ "stage": self.stage, "again": true }))?;
+        } else {
+            let columns = self.keep.map(|(save, _)| {
+                let mut columns = checkpoint::Writer::default();
+                save(&value, &mut columns);
+                columns
+            });
+            // Both wait for the disk.
+            let (stage, folder) = (self.stage, line.folder);
+            let (kept, files) = rayon::join(
+                || columns.map_or(Ok(()), |columns| folder.keep(stage, &columns).map_err(Error::in_stage(stage))),
+                || folder.publish(&staging),
+            );
+            kept?;
+            let files = files?;
+            let seconds = begun.elapsed().as_secs_f64() - line.nested_seconds.get();
+            line.end(self.stage, files, summary, seconds)?;
         }
-        line.folder.note("stage-finished", serde_json::json!({ "stage": self.stage, "again": fresh }))?;
         line.nested_seconds.set(nested_before + begun.elapsed().as_secs_f64());
         Ok(value)
     }
@@ -271,4 +320,43 @@ pub fn peak_memory_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
     line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()).map_or(0, |kib| kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    struct Silent;
+
+    impl Observer for Silent {
+        fn started(&self, _: &'static str) {}
+        fn finished(&self, _: &'static str, _: f64, _: bool) {}
+        fn warned(&self, _: &'static str, _: &Warning) {}
+        fn resumed(&self, _: &str) {}
+    }
+
+    const STAGES: &[Stage] =
+        &[Stage { name: "one", version: 1, needs: &[] }, Stage { name: "two", version: 1, needs: &[] }];
+
+    #[test]
+    fn of_two_stages_side_by_side_the_one_that_succeeds_is_finished() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = RunFolder::open(place.path()).unwrap();
+        let line = || Line::new(&folder, &Silent, plan(STAGES, |_| json!(null), |_| BTreeMap::new()));
+        let refuse = |_: &Path| Err(Error::NoInput);
+        let write = |staging: &Path| {
+            std::fs::write(staging.join("a.txt"), "a").unwrap();
+            Ok(((), json!({ "letters": 1 })))
+        };
+        let first = line();
+        let error = first.side_by_side([("one", &refuse), ("two", &write)]).unwrap_err();
+        assert!(matches!(error, Error::NoInput) && first.has_worked());
+        let next = line();
+        assert!(!next.is_fresh("one") && next.is_fresh("two"));
+        assert_eq!(next.record("two").unwrap().summary["letters"], 1);
+        assert_eq!(std::fs::read(place.path().join("a.txt")).unwrap(), b"a");
+        next.side_by_side([("one", &write), ("two", &write)]).unwrap();
+        assert!(next.is_fresh("one") && line().is_fresh("one"));
+    }
 }

@@ -150,38 +150,48 @@ pub fn profile(input: &Input, settings: &Settings) -> Profile {
     let count = (((high - start) / step).ceil() as usize).max(1);
     let piece = |u: f64| (((u - start) / step).floor().max(0.0) as usize).min(count - 1);
 
-    let measured = distortion::of_faces(mesh, uv);
-    let mut stretch: Vec<Vec<[f64; 2]>> = vec![Vec::new(); count];
-    let (mut area, mut filled, mut flipped) = (vec![0.0; count], vec![0.0; count], vec![0.0; count]);
-    for (f, corners) in mesh.faces().iter().enumerate() {
-        let in_chart = corners.map(|v| uv[v as usize]);
-        let at = piece((in_chart[0].x + in_chart[1].x + in_chart[2].x) / 3.0);
-        area[at] += measured[f].area;
-        filled[at] += if mesh.observed()[f] { 0.0 } else { measured[f].area };
-        flipped[at] += f64::from(u8::from(distortion::orientation(in_chart) <= 0.0));
-        if measured[f].is_defined() {
-            stretch[at].push([measured[f].stretch(), measured[f].area]);
-        }
-    }
     let weighted = |values: &[[f64; 2]], q: f64| {
         let (v, w): (Vec<f64>, Vec<f64>) = values.iter().map(|[v, w]| (*v, *w)).unzip();
         statistics::weighted_quantile(&v, &w, q)
     };
-    let stretch_p95: Vec<Option<f64>> = stretch.iter().map(|s| weighted(s, 0.95)).collect();
-
-    let mut offsets: Vec<Vec<f64>> = vec![Vec::new(); count];
-    let mut points = vec![0.0; count];
-    for (p, offset) in input.points.iter().flat_map(|(uv, offsets)| uv.iter().zip(*offsets)) {
-        if p.x.is_finite() && offset.abs() <= MOST_NOISE_M {
-            points[piece(p.x)] += 1.0;
-            offsets[piece(p.x)].push(*offset);
+    let of_faces = || {
+        let measured = distortion::of_faces(mesh, uv);
+        let mut stretch: Vec<Vec<[f64; 2]>> = vec![Vec::new(); count];
+        let (mut area, mut filled, mut flipped) = (vec![0.0; count], vec![0.0; count], vec![0.0; count]);
+        for (f, corners) in mesh.faces().iter().enumerate() {
+            let in_chart = corners.map(|v| uv[v as usize]);
+            let at = piece((in_chart[0].x + in_chart[1].x + in_chart[2].x) / 3.0);
+            area[at] += measured[f].area;
+            filled[at] += if mesh.observed()[f] { 0.0 } else { measured[f].area };
+            flipped[at] += f64::from(u8::from(distortion::orientation(in_chart) <= 0.0));
+            if measured[f].is_defined() {
+                stretch[at].push([measured[f].stretch(), measured[f].area]);
+            }
         }
-    }
+        let stretch_p95: Vec<Option<f64>> = stretch.iter().map(|s| weighted(s, 0.95)).collect();
+        let beyond_one: Vec<[f64; 2]> =
+            measured.iter().filter(|m| m.is_defined()).map(|m| [(m.stretch() - 1.0) * 100.0, m.area]).collect();
+        (area, filled, flipped, stretch_p95, histogram("stretch beyond 1", "%", &beyond_one, false))
+    };
+    let of_points = || {
+        let mut offsets: Vec<Vec<f64>> = vec![Vec::new(); count];
+        for (p, offset) in input.points.iter().flat_map(|(uv, offsets)| uv.iter().zip(*offsets)) {
+            if p.x.is_finite() && offset.abs() <= MOST_NOISE_M {
+                offsets[piece(p.x)].push(*offset);
+            }
+        }
+        let points: Vec<f64> = offsets.iter().map(|o| o.len() as f64).collect();
+        let noise: Vec<Option<f64>> = offsets.iter().map(|o| scatter(o)).collect();
+        let all_offsets: Vec<f64> = offsets.into_iter().flatten().collect();
+        let values: Vec<[f64; 2]> = all_offsets.iter().map(|o| [o * 1000.0, 1.0]).collect();
+        let distances = histogram("distance of the points from the surface", "mm", &values, true);
+        (points, noise, scatter(&all_offsets), distances)
+    };
+    let ((area, filled, flipped, stretch_p95, stretches), (points, noise, noise_whole_m, distances)) =
+        rayon::join(of_faces, of_points);
     let has_points = input.points.is_some();
     let each = |of: &dyn Fn(usize) -> Option<f64>| -> Vec<Option<f64>> { (0..count).map(of).collect() };
     let density = each(&|i| (has_points && area[i] > 0.0).then(|| points[i] / area[i]));
-    let noise: Vec<Option<f64>> = offsets.iter().map(|o| scatter(o)).collect();
-    let all_offsets: Vec<f64> = offsets.into_iter().flatten().collect();
     let coverage = match &input.coverage {
         None => vec![None; count],
         Some(columns) => {
@@ -217,15 +227,9 @@ pub fn profile(input: &Input, settings: &Settings) -> Profile {
         }
     }
     let mut densities: Vec<f64> = (0..count).filter(|&i| counts(i)).filter_map(|i| density[i]).collect();
-    let mut histograms = vec![histogram(
-        "stretch beyond 1",
-        "%",
-        &measured.iter().filter(|m| m.is_defined()).map(|m| [(m.stretch() - 1.0) * 100.0, m.area]).collect::<Vec<_>>(),
-        false,
-    )];
+    let mut histograms = vec![stretches];
     if has_points {
-        let values: Vec<[f64; 2]> = all_offsets.iter().map(|o| [o * 1000.0, 1.0]).collect();
-        histograms.push(histogram("distance of the points from the surface", "mm", &values, true));
+        histograms.push(distances);
     }
     let relief: Vec<[f64; 2]> = input
         .coordinates
@@ -247,7 +251,7 @@ pub fn profile(input: &Input, settings: &Settings) -> Profile {
         noise_m: noise,
         worst,
         density_p05_per_m2: statistics::quantile(&mut densities, 0.05),
-        noise_whole_m: scatter(&all_offsets),
+        noise_whole_m,
         histograms: histograms.into_iter().flatten().collect(),
         sections,
         warnings,

@@ -37,14 +37,14 @@ use std::time::SystemTime;
 /// The stages in their order. Raise a version when the stage gives other results for the same input.
 pub const STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
-    Stage { name: "clean", version: 1, needs: &["ingest"] },
+    Stage { name: "clean", version: 2, needs: &["ingest"] },
     Stage { name: "axis", version: 4, needs: &["clean"] },
-    Stage { name: "normals", version: 1, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "normals", version: 2, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 5, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
-    Stage { name: "anchor", version: 2, needs: &["unwrap", "ingest"] },
+    Stage { name: "anchor", version: 3, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 4, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
@@ -329,7 +329,9 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
         cleaned.release();
         let (mesh, mut summary) = done("mesh", mesh::reconstruct(&segmentation, &axis, &pipeline.mesh))?;
         tell_ends(&mut summary, cloud.get()?.frame());
-        let quality = points.quality.at(&segmentation.section, &axis, mesh.vertices());
+        let axis: &Axis = &axis;
+        let places: Vec<AxisCoordinates> = mesh.vertices().par_iter().map(|p| axis.project(p)).collect();
+        let quality = points.quality.at(&segmentation.section, &places);
         write_ply("mesh", &staging.join("mesh.ply"), cloud.get()?.frame(), &mesh, None, Some(&quality))?;
         let feet = feet(&segmentation);
         let (section, floor) = (segmentation.section.clone(), segmentation.floor.clone());
@@ -360,46 +362,29 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
     });
     let placed = line.product("anchor", |_| {
         let (cloud, chart) = (cloud.get()?, chart.get()?);
+        let chart: &Chart = &chart;
         let mesh = chart.strip().mesh();
-        let (mut anchors, summary) = anchor::anchor_points(mesh, cloud.positions(), &pipeline.anchor);
-        let index = unwrap::ChartIndex::of(&chart);
-        let covered = unwrap::covered_points(&index, &anchors);
+        let (index, anchoring) = rayon::join(|| unwrap::ChartIndex::of(chart), || anchor::Anchoring::of(mesh));
+        let (mut anchors, summary) = anchoring.anchor(cloud.positions(), &pipeline.anchor);
+        let (covered, round_trip) =
+            unwrap::covered_and_round_trip(&index, &anchors, cloud.positions(), anchoring.normals());
         anchors.release(&covered);
         let mut summary = section(&summary);
         summary["covered"] = json!(covered.len());
         summary["warnings"] = json!(covered_warning(covered.len()));
-        summary["roundtrip"] = json!(unwrap::round_trip(&index, &anchors, cloud.positions()));
+        summary["roundtrip"] = json!(round_trip);
         Ok((PlacedPoints { uv: anchors.in_chart(mesh, chart.uv()), offsets_m: anchors.offsets().to_vec() }, summary))
     });
     let map = line.passing("map", |staging| {
-        let (cloud, chart, axis, surface) = (cloud.get()?, chart.get()?, axis.get()?, surface.get()?);
-        let placed = placed.get()?;
+        let (cloud, chart, axis) = (cloud.get()?, chart.get()?, axis.get()?);
         let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
-        let around = around_the_axis(pipeline, &chart, places, &axis, &surface)?;
-        let vertices = chart.strip().mesh().vertices();
-        let quality = surface.points.as_ref().map(|p| p.quality.at(&surface.section, &axis, vertices));
-        let input = map::DrawInput {
-            chart: &chart,
-            points: Some((&cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
-            frame: cloud.frame(),
-            section_offsets_m: Some(&around.section_offsets_m),
-            design_offsets_m: around.design_offsets_m.as_deref(),
-            quality: quality.as_ref(),
-        };
-        draw_map(pipeline, &input, &around.lines, staging)
+        let (surface, placed) = (surface.get()?, placed.get()?);
+        let scan = MappedScan { cloud: &cloud, surface: &surface, placed: &placed };
+        draw_scan_map(pipeline, &scan, &chart, &axis, places, staging)
     });
     let points = line.passing("points", |staging| {
         let (cloud, placed, surface) = (cloud.get()?, placed.get()?, surface.get()?);
-        let labels = cloud.attributes().labels.clone().unwrap_or_else(|| vec![0; cloud.len()]);
-        let columns = io::PointColumns {
-            labels: &labels,
-            chainage: &placed.uv.iter().map(|p| p.x).collect::<Vec<_>>(),
-            girth: &placed.uv.iter().map(|p| p.y).collect::<Vec<_>>(),
-            offset: &placed.offsets_m,
-            surface_classes: surface.points.as_ref().map(|p| &p.class_of_point[..]),
-        };
-        let written = io::write_points(&cloud, &columns, &staging.join(points_file(&pipeline.input)));
-        done("points", written.map(|summary| ((), summary)))
+        write_scan_points(pipeline, &MappedScan { cloud: &cloud, surface: &surface, placed: &placed }, staging)
     });
     let profile = line.passing("profile", |_| {
         map.ensure()?;
@@ -417,9 +402,66 @@ fn run_scan<'a>(pipeline: &'a Pipeline, stamps: &'a Stamps, line: &'a Line<'a>, 
     surface.ensure()?;
     chart.ensure()?;
     placed.ensure()?;
+    if !line.is_fresh("points") && !line.is_fresh("map") {
+        let (cloud, chart, axis) = (cloud.get()?, chart.get()?, axis.get()?);
+        let places = vertex_coordinates(&coordinates, chart.strip().mesh(), &axis);
+        let (surface, placed) = (surface.get()?, placed.get()?);
+        let scan = MappedScan { cloud: &cloud, surface: &surface, placed: &placed };
+        let (chart, axis): (&Chart, &Axis) = (&chart, &axis);
+        line.side_by_side([
+            ("points", &|staging| write_scan_points(pipeline, &scan, staging)),
+            ("map", &|staging| draw_scan_map(pipeline, &scan, chart, axis, places, staging)),
+        ])?;
+    }
     points.ensure()?;
     map.ensure()?;
     profile.ensure()
+}
+
+/// A scan whose points have their places on the map.
+struct MappedScan<'a> {
+    cloud: &'a Cloud,
+    surface: &'a Surface,
+    placed: &'a PlacedPoints,
+}
+
+/// The map of a scan; `places` are the axis coordinates of the chart's vertices.
+fn draw_scan_map(
+    pipeline: &Pipeline,
+    scan: &MappedScan,
+    chart: &Chart,
+    axis: &Axis,
+    places: &[AxisCoordinates],
+    staging: &Path,
+) -> Result<((), serde_json::Value), Error> {
+    let MappedScan { cloud, surface, placed } = scan;
+    let around = around_the_axis(pipeline, chart, places, axis, surface)?;
+    let quality = surface.points.as_ref().map(|p| p.quality.at(&surface.section, places));
+    let input = map::DrawInput {
+        chart,
+        points: Some((cloud, map::PointsOnMap { uv: &placed.uv, offsets_m: &placed.offsets_m })),
+        frame: cloud.frame(),
+        section_offsets_m: Some(&around.section_offsets_m),
+        design_offsets_m: around.design_offsets_m.as_deref(),
+        quality: quality.as_ref(),
+    };
+    draw_map(pipeline, &input, &around.lines, staging)
+}
+
+/// The file with all points of a scan.
+fn write_scan_points(pipeline: &Pipeline, scan: &MappedScan, staging: &Path) -> Result<((), serde_json::Value), Error> {
+    let MappedScan { cloud, surface, placed } = scan;
+    let labels = cloud.attributes().labels.clone().unwrap_or_else(|| vec![0; cloud.len()]);
+    let (chainage, girth): (Vec<f64>, Vec<f64>) = placed.uv.iter().map(|p| (p.x, p.y)).unzip();
+    let columns = io::PointColumns {
+        labels: &labels,
+        chainage: &chainage,
+        girth: &girth,
+        offset: &placed.offsets_m,
+        surface_classes: surface.points.as_ref().map(|p| &p.class_of_point[..]),
+    };
+    let written = io::write_points(cloud, &columns, &staging.join(points_file(&pipeline.input)));
+    done("points", written.map(|summary| ((), summary)))
 }
 
 /// From a mesh to a map of its surface; it enters at `cut`, its vertices stand for the points where some are needed.

@@ -6,6 +6,7 @@
 //! With a scratch folder (`--tmp`) stages prepare their products and keep their checkpoints there; products still come into
 //! the run folder by a rename. `.adit/journal.jsonl` tells what was begun and finished, and when.
 
+use super::checkpoint;
 use super::error::Kind;
 use super::folder_lock::FolderLock;
 use rayon::prelude::*;
@@ -278,6 +279,17 @@ impl RunFolder {
     /// Where the checkpoint of a stage is.
     pub fn checkpoint(&self, stage: &str) -> PathBuf {
         self.scratch.join(format!("{stage}.columns"))
+    }
+
+    /// Writes the checkpoint of a stage under a temporary name and renames it.
+    ///
+    /// # Errors
+    /// [`checkpoint::Error::Io`].
+    pub(super) fn keep(&self, stage: &str, columns: &checkpoint::Writer) -> Result<(), checkpoint::Error> {
+        let temporary = self.scratch.join(format!("tmp-{stage}-checkpoint"));
+        columns.write(&temporary)?;
+        let place = self.checkpoint(stage);
+        fs::rename(&temporary, &place).map_err(|source| checkpoint::Error::Io { path: place.clone(), source })
     }
 
     /// The record of a stage; `None` when it has none that reads.

@@ -8,7 +8,7 @@
 
 use super::unrolled_grid::{Grid, GridPoint};
 use super::{Class, SectionField, Segmentation};
-use crate::axis::Axis;
+use crate::axis::AxisCoordinates;
 use crate::normals::OrientedCloud;
 use crate::numeric::{Vec3, angle_between};
 use rayon::prelude::*;
@@ -135,9 +135,9 @@ impl Quality {
         }
     }
 
-    /// The values at places of the surface.
-    pub fn at(&self, section: &SectionField, axis: &Axis, places: &[Vec3]) -> VertexQuality {
-        let on_grid: Vec<GridPoint> = places.par_iter().map(|p| self.grid.unroll(section, &axis.project(p))).collect();
+    /// The values at places of the surface, given in axis coordinates.
+    pub fn at(&self, section: &SectionField, places: &[AxisCoordinates]) -> VertexQuality {
+        let on_grid: Vec<GridPoint> = places.par_iter().map(|p| self.grid.unroll(section, p)).collect();
         let blend = |values: &[f32]| on_grid.par_iter().map(|p| self.blend(values, p)).collect();
         let no_station = self.incidence_deg.iter().all(|v| v.is_nan());
         VertexQuality {
@@ -222,7 +222,10 @@ mod tests {
         let quality = Quality::of(&oriented, &segmentation, geometry.counts(), |_| Some(station));
         let place = |s: f64, angle: f64| axis.point_at(&crate::axis::AxisCoordinates::from_polar(s, angle, 2.0));
         // Beside the station, 4 m along, and behind the duct (at 48 degrees right of the crown).
-        let found = quality.at(&segmentation.section, &axis, &[place(6.0, -1.5), place(10.0, -1.5), place(6.0, 0.84)]);
+        let found = quality.at(
+            &segmentation.section,
+            &[place(6.0, -1.5), place(10.0, -1.5), place(6.0, 0.84)].map(|p| axis.project(&p)),
+        );
         // The noise is along the beam: across the wall it is less where the beam grazes it.
         assert!((found.noise_m[0] - 0.003).abs() < 0.0006, "{found:?}");
         assert!(found.noise_m[1] < 0.75 * found.noise_m[0], "{found:?}");
@@ -232,8 +235,8 @@ mod tests {
         assert_eq!(found.class, [Class::Wall as u8, Class::Wall as u8, Class::Furniture as u8]);
         let (a, b, [x, y, z], class) = quality.columns();
         let again = Quality::from_columns(a, b, [x.to_vec(), y.to_vec(), z.to_vec()], class.to_vec()).unwrap();
-        assert_eq!(again.at(&segmentation.section, &axis, &[place(6.0, -1.5)]).noise_m[0], found.noise_m[0]);
+        assert_eq!(again.at(&segmentation.section, &[axis.project(&place(6.0, -1.5))]).noise_m[0], found.noise_m[0]);
         let blind = Quality::of(&oriented, &segmentation, geometry.counts(), |_| None);
-        assert!(blind.at(&segmentation.section, &axis, &[place(6.0, 0.0)]).incidence_deg.is_empty());
+        assert!(blind.at(&segmentation.section, &[axis.project(&place(6.0, 0.0))]).incidence_deg.is_empty());
     }
 }

@@ -36,7 +36,7 @@ pub fn for_each_neighbourhood<T: Send + Clone>(
     BundleTree::new(points).for_each(count, visit)
 }
 
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Box3 {
     low: Vec3,
     high: Vec3,
@@ -50,6 +50,7 @@ impl Box3 {
     }
 }
 
+#[derive(Clone, Debug, PartialEq)]
 struct Node {
     bounds: Box3,
     /// Points for a bundle; unused for an inner node.
@@ -60,6 +61,7 @@ struct Node {
 }
 
 /// Points ready to be asked for the neighbours of each of them.
+#[derive(Clone, Debug, PartialEq)]
 pub struct BundleTree {
     /// Coordinates along the curve.
     x: Vec<f64>,
@@ -67,6 +69,8 @@ pub struct BundleTree {
     z: Vec<f64>,
     /// Index of each of them in the input.
     order: Vec<u32>,
+    /// Whether the input was in the order of the curve already.
+    ordered: bool,
     nodes: Vec<Node>,
     bundles: Vec<(u32, u32)>,
 }
@@ -91,16 +95,26 @@ struct Search {
 impl BundleTree {
     /// Sorts finite points and builds the tree.
     pub fn new(points: &[Vec3]) -> Self {
-        let Some((low, high)) = super::voxel_grid::bounds(points) else {
-            let none = Vec::new;
-            return Self { x: none(), y: none(), z: none(), order: vec![], nodes: vec![], bundles: vec![] };
-        };
+        let Some((low, high)) = super::voxel_grid::bounds(points) else { return Self::of_ordered(points) };
         // A cell of about one point on a surface; the order inside a cell does not matter.
         let extent = (high - low).amax();
         let cell_m = (extent / (points.len() as f64).sqrt()).max(1e-9 * extent).max(1e-12);
-        let order = VoxelGrid::new(points, cell_m).into_order();
+        Self::along(points, VoxelGrid::new(points, cell_m).into_order(), false)
+    }
+
+    /// Builds the tree over finite points that come in a spatial order already (that of a [`VoxelGrid`]): no sort, and
+    /// places on the curve are the points' own indices.
+    pub fn of_ordered(points: &[Vec3]) -> Self {
+        Self::along(points, (0..points.len() as u32).collect(), true)
+    }
+
+    fn along(points: &[Vec3], order: Vec<u32>, ordered: bool) -> Self {
         let along = |axis: usize| order.par_iter().map(|&i| points[i as usize][axis]).collect();
-        let mut tree = Self { x: along(0), y: along(1), z: along(2), order, nodes: Vec::new(), bundles: Vec::new() };
+        let (x, y, z) = (along(0), along(1), along(2));
+        let mut tree = Self { x, y, z, order, ordered, nodes: Vec::new(), bundles: Vec::new() };
+        if points.is_empty() {
+            return tree;
+        }
         let whole = 0..tree.order.len();
         // Parts are built side by side and appended in order.
         let mut parts = vec![whole];
@@ -154,13 +168,50 @@ impl BundleTree {
         parts.into_iter().flatten().collect()
     }
 
+    /// The `count` points nearest to the one at a place (itself included; all when there are fewer), by their index in
+    /// the input, nearest first, equal distances by index.
+    pub fn nearest(&self, place: usize, count: usize) -> Vec<Neighbour> {
+        if count == 0 {
+            return Vec::new();
+        }
+        let alone = [(place as u32, place as u32 + 1)];
+        self.answer(&alone, count, &|at| self.order[at], &|_, found| found.to_vec()).pop().unwrap_or_default()
+    }
+
+    /// Places on the curve of some of the points, given by their index.
+    pub fn places_of(&self, points: &[usize]) -> Vec<usize> {
+        if self.ordered {
+            return points.to_vec();
+        }
+        let places = self.places();
+        points.iter().map(|&point| places[point] as usize).collect()
+    }
+
     /// Values along the curve, put into the order of the points.
     pub fn in_point_order<T: Clone + Send>(&self, along_curve: Vec<T>) -> Vec<T> {
-        let mut place = vec![0u32; self.order.len()];
-        for (at, &i) in self.order.iter().enumerate() {
-            place[i as usize] = at as u32;
+        if self.ordered {
+            return along_curve;
         }
-        place.into_iter().map(|at| along_curve[at as usize].clone()).collect()
+        self.places().into_iter().map(|at| along_curve[at as usize].clone()).collect()
+    }
+
+    /// Place on the curve of each point.
+    fn places(&self) -> Vec<u32> {
+        let mut places = vec![0u32; self.order.len()];
+        for (at, &i) in self.order.iter().enumerate() {
+            places[i as usize] = at as u32;
+        }
+        places
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.order.len()
+    }
+
+    /// Whether there are no points.
+    pub fn is_empty(&self) -> bool {
+        self.order.is_empty()
     }
 
     /// The point at a place of the curve.
@@ -462,6 +513,16 @@ mod tests {
         }
     }
 
+    /// Searches one by one find what the search of all finds, whether the points come in order or not.
+    fn assert_single_searches_agree(points: &[Vec3]) {
+        let some: Vec<usize> = (0..points.len()).step_by(37).collect();
+        let all = for_each_neighbourhood(points, 9, |_, found| found.to_vec());
+        for tree in [BundleTree::new(points), BundleTree::of_ordered(points)] {
+            let places = tree.places_of(&some);
+            assert!(some.iter().zip(places).all(|(&i, place)| tree.nearest(place, 9) == all[i]));
+        }
+    }
+
     #[test]
     fn agrees_with_the_tree() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(8);
@@ -477,6 +538,7 @@ mod tests {
         with_outliers.extend((0..20).map(|i| Vec3::new(1000.0 * i as f64, -500.0, 40.0)));
         let same = vec![Vec3::new(1.0, 1.0, 1.0); 200];
         for points in [cylinder, profiles, with_outliers, same] {
+            assert_single_searches_agree(&points);
             assert_same_as_the_tree(&points, 16);
             assert_same_as_the_tree(&points[..points.len().min(40)], 64);
         }
@@ -485,6 +547,7 @@ mod tests {
     #[test]
     fn few_or_no_points() {
         assert!(for_each_neighbourhood(&[], 5, |_, n| n.len()).is_empty());
+        assert!(BundleTree::new(&[Vec3::zeros(), Vec3::x()]).nearest(1, 0).is_empty());
         assert_eq!(for_each_neighbourhood(&[Vec3::zeros(), Vec3::x()], 5, |_, n| n.len()), [2, 2]);
     }
 }

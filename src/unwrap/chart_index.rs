@@ -158,6 +158,12 @@ fn barycentric([a, b, c]: [Vec2; 3], p: Vec2) -> Option<[f64; 3]> {
 /// A point whose place on the map leads to a surface point farther than this from its own, metres, lies on a covered
 /// sheet. Rounding between neighbouring faces stays far below.
 const COVERED_M: f64 = 1e-7;
+/// Points sent by one task.
+const RUN: usize = 4096;
+
+fn is_elsewhere(back: &Vec3, sent: &Vec3) -> bool {
+    !((back - sent).norm() <= COVERED_M)
+}
 
 /// The points that the map cannot tell apart from others: their place is covered by another sheet of the chart, which
 /// happens where the border of the chart crosses itself. The map shows one sheet; the points of the other have no place.
@@ -172,13 +178,51 @@ pub fn covered_points(index: &ChartIndex, anchors: &Anchors) -> Vec<usize> {
                 Some(foot) if foot.face == anchor.face => false,
                 Some(foot) => {
                     let back = SurfacePoint { offset: anchor.offset, ..foot }.position(mesh, &normals);
-                    !((back - anchor.position(mesh, &normals)).norm() <= COVERED_M)
+                    is_elsewhere(&back, &anchor.position(mesh, &normals))
                 }
                 // A flipped or collapsed face: nothing of it is on the map.
                 None => true,
             }
         })
         .collect()
+}
+
+/// [`covered_points`], and the [`round_trip`] of all others, with one search of the map for both. `normals` are the
+/// vertex normals of the chart's mesh.
+pub fn covered_and_round_trip(
+    index: &ChartIndex,
+    anchors: &Anchors,
+    points: &[Vec3],
+    normals: &[Vec3],
+) -> (Vec<usize>, RoundTrip) {
+    let mesh = index.chart.strip().mesh();
+    let of_run = |first: usize| {
+        let (mut covered, mut distances) = (Vec::new(), Vec::with_capacity(RUN));
+        for i in first..(first + RUN).min(points.len()) {
+            let Some(anchor) = anchors.get(i) else { continue };
+            let back = index.surface_point(anchor.in_chart(mesh, index.chart.uv())).map(|foot| {
+                let position = SurfacePoint { offset: anchor.offset, ..foot }.position(mesh, normals);
+                (foot.face, position)
+            });
+            match back {
+                Some((face, back)) if face == anchor.face || !is_elsewhere(&back, &anchor.position(mesh, normals)) => {
+                    if anchors.is_exact(i) {
+                        distances.push((back - points[i]).norm());
+                    }
+                }
+                // A flipped or collapsed face has nothing on the map.
+                _ => covered.push(i),
+            }
+        }
+        (covered, distances)
+    };
+    let runs: Vec<(Vec<usize>, Vec<f64>)> = (0..points.len()).into_par_iter().step_by(RUN).map(of_run).collect();
+    let (mut covered, mut distances) = (Vec::new(), Vec::with_capacity(points.len()));
+    for (some, theirs) in runs {
+        covered.extend(some);
+        distances.extend(theirs);
+    }
+    (covered, RoundTrip::of(distances))
 }
 
 /// What came of sending every anchored point to the map and back.
@@ -194,29 +238,35 @@ pub struct RoundTrip {
     pub p99_m: f64,
 }
 
+impl RoundTrip {
+    /// From the distance of each point, infinite for those that were lost.
+    fn of(distances: Vec<f64>) -> Self {
+        let points = distances.len();
+        let mut found = distances;
+        found.retain(|d| d.is_finite());
+        let max_m = found.iter().copied().fold(0.0, f64::max);
+        let p99_m = statistics::quantile(&mut found, 0.99).unwrap_or(0.0);
+        Self { points, lost: points - found.len(), max_m, p99_m }
+    }
+}
+
 /// Sends every exactly anchored point to (u, v, offset), finds the surface under (u, v) anew, and measures how far the
 /// point that comes back is from the one that was sent. Nothing of the anchor but (u, v, offset) is used on the way back.
 pub fn round_trip(index: &ChartIndex, anchors: &Anchors, points: &[Vec3]) -> RoundTrip {
-    let chart = index.chart;
-    let mesh = chart.strip().mesh();
+    let mesh = index.chart.strip().mesh();
     let normals = mesh.vertex_normals();
-    let errors: Vec<f64> = (0..points.len())
+    let distances = (0..points.len())
         .into_par_iter()
         .filter(|&i| anchors.is_exact(i))
         .filter_map(|i| anchors.get(i).map(|anchor| (i, anchor)))
-        .map(|(i, anchor)| match index.surface_point(anchor.in_chart(mesh, chart.uv())) {
+        .map(|(i, anchor)| match index.surface_point(anchor.in_chart(mesh, index.chart.uv())) {
             Some(foot) => {
                 let back = SurfacePoint { offset: anchor.offset, ..foot }.position(mesh, &normals);
                 (back - points[i]).norm()
             }
             None => f64::INFINITY,
-        })
-        .collect();
-    let lost = errors.iter().filter(|e| e.is_infinite()).count();
-    let mut found: Vec<f64> = errors.iter().copied().filter(|e| e.is_finite()).collect();
-    let max_m = found.iter().copied().fold(0.0, f64::max);
-    let p99_m = statistics::quantile(&mut found, 0.99).unwrap_or(0.0);
-    RoundTrip { points: errors.len(), lost, max_m, p99_m }
+        });
+    RoundTrip::of(distances.collect())
 }
 
 #[cfg(test)]
@@ -274,8 +324,10 @@ mod tests {
         let covered = covered_points(&index, &anchors);
         assert!(before.max_m > 0.1 || before.lost > 0, "{before:?}");
         assert!(!covered.is_empty() && covered.len() * 2 < points.len(), "{}", covered.len());
+        let both = covered_and_round_trip(&index, &anchors, &points, &mesh.vertex_normals());
         anchors.release(&covered);
         let after = round_trip(&index, &anchors, &points);
+        assert_eq!(both, (covered.clone(), after.clone()));
         assert_eq!((after.points, after.lost), (points.len() - covered.len(), 0));
         assert!(after.max_m < 1e-9, "{after:?}");
     }

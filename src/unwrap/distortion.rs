@@ -340,8 +340,10 @@ pub fn smoothed_surface(mesh: &Mesh, scale: f64) -> Mesh {
             }
         }
     }
+    let edges = unique.len() as f64;
+    drop((unique, fill));
     // A half-way step has variance mean(edge^2) / 4 in each direction of the surface (random walk of half the mass).
-    let step_variance = squared / unique.len() as f64 / 4.0;
+    let step_variance = squared / edges / 4.0;
     let steps = ((scale / 2.0).powi(2) / step_variance).round().clamp(1.0, 400.0) as usize;
     let mut positions = mesh.vertices().to_vec();
     for _ in 0..steps {

@@ -44,7 +44,7 @@ mod independent;
 #[cfg(test)]
 mod robustness;
 
-pub use chart_index::{ChartIndex, RoundTrip, covered_points, round_trip};
+pub use chart_index::{ChartIndex, RoundTrip, covered_and_round_trip, covered_points, round_trip};
 pub use distortion::Distortion;
 pub use guide::Guide;
 pub use handles::Handle;
@@ -379,12 +379,7 @@ pub fn flatten_guided(strip: Strip, guide: Option<Guide>, settings: &Settings) -
         let girth = guide.as_ref().map_or_else(|| strip.mesh().area().sqrt(), |g| g.summary().section.mean_girth_m);
         SMOOTHING_M.min(girth * SMOOTHING_OF_GIRTH)
     });
-    // Most solvers leave a core idle for a while.
-    let (solved, smoothed) = rayon::join(
-        || settings.method.solve(&strip, guide.as_ref()),
-        || (smoothing_m > 0.0).then(|| distortion::smoothed_surface(strip.mesh(), smoothing_m)),
-    );
-    let (mut uv, solve) = solved?;
+    let (mut uv, solve) = settings.method.solve(&strip, guide.as_ref())?;
     let placement = registration::place(&strip, guide.as_ref(), settings.method.freedom(), &mut uv)?;
     let chart = Chart::new(strip, uv)?;
 
@@ -394,12 +389,13 @@ pub fn flatten_guided(strip: Strip, guide: Option<Guide>, settings: &Settings) -
     if let Some(guide) = &guide {
         warnings.extend(guide.summary().warnings.iter().cloned());
     }
-    let ((distortion, overlaps), (smoothed, readability)) = rayon::join(
-        || (Distortion::of(mesh, uv), distortion::border_crossings(chart.strip(), uv)),
+    // The surface is smoothed only now: the memory of the solve, which needs the most, is free again.
+    let ((distortion, overlaps, readability), smoothed) = rayon::join(
         || {
-            let smoothed = smoothed.map(|surface| Distortion::of(&surface, uv));
-            (smoothed, guide.as_ref().map(|guide| Readability::of(mesh, uv, guide)))
+            let readability = guide.as_ref().map(|guide| Readability::of(mesh, uv, guide));
+            (Distortion::of(mesh, uv), distortion::border_crossings(chart.strip(), uv), readability)
         },
+        || (smoothing_m > 0.0).then(|| Distortion::of(&distortion::smoothed_surface(mesh, smoothing_m), uv)),
     );
     let summary = Summary {
         method: settings.method.name().to_owned(),

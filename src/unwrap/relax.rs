@@ -47,6 +47,7 @@ use super::triangle_shapes::{Shape, Shapes};
 use super::{Error, SolveSummary, distortion, slim};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
+use crate::numeric::dissection::nested_dissection;
 use crate::numeric::sparse::{Analysis, Cholesky, Pattern};
 use crate::numeric::{Mat2, Vec2};
 use rayon::prelude::*;
@@ -127,8 +128,12 @@ fn descend(
     summary: &mut SolveSummary,
 ) -> Result<Vec<Vec2>, Error> {
     let failed = |e: crate::numeric::sparse::Error| Error::Solve { method: "relax", what: e.to_string() };
-    let problem = Problem::new(strip.mesh(), guide, shapes, settings, &uv);
-    let step = Preconditioner::new(&problem).map_err(failed)?;
+    let mesh = strip.mesh();
+    let (problem, pattern) = rayon::join(
+        || Problem::new(mesh, guide, shapes, settings, &uv),
+        || Pattern::of_vertices(mesh.vertices().len(), mesh.faces()),
+    );
+    let step = pattern.and_then(|pattern| Preconditioner::new(&problem, &pattern, &uv)).map_err(failed)?;
 
     for _ in 0..RIGID_STEPS.min(settings.max_iterations) {
         let (gradient, before) = problem.rigid_gradient_and_energy(&uv);
@@ -351,9 +356,22 @@ struct Preconditioner {
 }
 
 impl Preconditioner {
-    fn new(problem: &Problem) -> Result<Self, crate::numeric::sparse::Error> {
-        let count = problem.tie.len();
-        let pattern = Pattern::of_vertices(count, problem.faces)?;
+    /// `uv` is any chart of the mesh: it tells which vertices are neighbours.
+    fn new(problem: &Problem, pattern: &Pattern, uv: &[Vec2]) -> Result<Self, crate::numeric::sparse::Error> {
+        let (analysis, (u, v)) = rayon::join(
+            || Analysis::in_order(pattern, &nested_dissection(pattern, uv)),
+            || Self::values(problem, pattern),
+        );
+        let analysis = analysis?;
+        let (u, v) = rayon::join(
+            || if problem.ruler { Ok(None) } else { Cholesky::new(pattern, &analysis, &u).map(Some) },
+            || Cholesky::new(pattern, &analysis, &v),
+        );
+        Ok(Self { u: u?, v: v? })
+    }
+
+    /// The entries of both systems.
+    fn values(problem: &Problem, pattern: &Pattern) -> (Vec<f64>, Vec<f64>) {
         let slots = pattern.face_slots(problem.faces);
         let mut u = vec![0.0; pattern.entries()];
         let mut v = vec![0.0; pattern.entries()];
@@ -374,18 +392,12 @@ impl Preconditioner {
             }
         }
         // v is tied by nothing to a place; a tie far below the isometry's weight holds its mean.
-        for j in 0..count {
+        for j in 0..problem.tie.len() {
             let unused = !problem.corner_sums.is_used(j);
             u[pattern.diagonal(j)] += if unused { 1.0 } else { 2.0 * problem.tie[j] };
             v[pattern.diagonal(j)] += if unused { 1.0 } else { 2.0 * problem.tie[j].max(f64::MIN_POSITIVE) };
         }
-        drop(slots);
-        let analysis = Analysis::new(&pattern)?;
-        let (u, v) = rayon::join(
-            || if problem.ruler { Ok(None) } else { Cholesky::new(&pattern, &analysis, &u).map(Some) },
-            || Cholesky::new(&pattern, &analysis, &v),
-        );
-        Ok(Self { u: u?, v: v? })
+        (u, v)
     }
 
     /// Solves for both coordinates and multiplies by `factor`.

@@ -182,7 +182,6 @@ impl FaceWeight {
         // U has angle (turn angle + mirror angle) / 2.
         let double = h.atan2(e) + g.atan2(f);
         let (sin, cos) = double.sin_cos();
-        let (mean, half) = ((w1 + w2) / 2.0, (w1 - w2) / 2.0);
         let form = |w1: f64, w2: f64| {
             let (mean, half) = ((w1 + w2) / 2.0, (w1 - w2) / 2.0);
             [mean + half * cos, half * sin, mean - half * cos]
