@@ -206,7 +206,8 @@ impl Skeleton {
     pub fn widest_way(&self, void: &EnclosedVoid) -> Vec<Vec3> {
         let layers = void.layers();
         let width = |rank: usize| f64::from(layers[rank]).max(1.0);
-        let (cost, from) = cheapest(void, &self.ends[0], |step, a, b| step * 2.0 / (width(a).powi(2) + width(b).powi(2)));
+        let (cost, from) =
+            cheapest(void, &self.ends[0], |step, a, b| step * 2.0 / (width(a).powi(2) + width(b).powi(2)));
         let target = self.ends[1].iter().copied().min_by(|&a, &b| cost[a].total_cmp(&cost[b])).unwrap_or(0);
         let mut way = vec![target];
         while let Some(before) = from[way[way.len() - 1]] {

@@ -20,6 +20,8 @@ use serde::Serialize;
 const EXACT_M: f64 = 1e-6;
 /// A segment is not halved below this length, metres.
 const SHORTEST_M: f64 = 1e-3;
+/// Where the map jumps it is, down to this length: as much of a line is lost at the seam.
+const LOST_AT_SEAM_M: f64 = 1e-6;
 /// Map length that a 3D length may have: more is a jump from one side of the seam to the other. The second term, metres,
 /// lets short segments pass steps of the relief.
 const JUMP: (f64, f64) = (4.0, 0.02);
@@ -230,7 +232,7 @@ impl Flattener<'_> {
         }
         let middle = (a + b) / 2.0;
         match self.place(&middle) {
-            Some(place) if length > SHORTEST_M => {
+            Some(place) if length > LOST_AT_SEAM_M => {
                 self.segment((a, from), (middle, place), parts);
                 self.segment((middle, place), (b, to), parts);
             }

@@ -8,6 +8,7 @@ mod void_side;
 mod surface_nets;
 pub mod repair;
 mod handles;
+mod narrow;
 mod fill;
 pub mod decimate;
 pub mod anchor;

@@ -295,7 +295,18 @@ fn by_poisson(
             warnings.push(openings::warning(&openings));
         }
     }
+    surface_under_repair.keep_largest();
+    surface_under_repair.cut_narrow();
     let (mesh, repaired) = finish(surface_under_repair, axis, settings, &mut warnings);
+    if repaired.narrow_faces_dropped > 0 {
+        warnings.push(Warning::new(
+            "narrow-parts-dropped",
+            format!(
+                "{} faces of fingers and throats about a cell thick were left out, and closed where they stood",
+                repaired.narrow_faces_dropped
+            ),
+        ));
+    }
     if mesh.faces().is_empty() {
         return Err(Error::NoSurface { points: surface });
     }

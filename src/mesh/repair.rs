@@ -1,12 +1,18 @@
 //! Small repairs that turn a list of oriented triangles into one oriented manifold: every change is counted.
 
 use super::topology::{self, NO_TWIN};
-use super::{FaceId, Mesh, VertexId, fill, handles};
+use super::{FaceId, Mesh, VertexId, fill, handles, narrow};
 use crate::numeric::Vec3;
 use serde::Serialize;
+use std::collections::HashSet;
 
 /// Rounds of cutting handles after which the rest is given up and told.
 const MOST_ROUNDS: usize = 60;
+
+/// Rounds of taking away what is narrow: closing what one stood on may leave another.
+const NARROW_ROUNDS: usize = 3;
+/// Most edges of a hole that is left by what was narrow.
+const NARROW_RIM: usize = 24;
 
 /// Gives each fan of faces around a vertex a vertex of its own; returns how many vertices were added.
 ///
@@ -131,6 +137,8 @@ pub struct Summary {
     pub components_dropped: usize,
     /// Faces of those components.
     pub faces_dropped: usize,
+    /// Faces dropped because the surface closes around itself there within a few edges: fingers and throats.
+    pub narrow_faces_dropped: usize,
     /// Handles of the surface that were cut open.
     pub handles_cut: usize,
     /// Length of these cuts, metres.
@@ -226,6 +234,33 @@ impl Repaired {
         self.summary.faces_dropped += kept.faces_dropped;
     }
 
+    /// Takes away fingers and throats that are a few edges around, keeps the largest component and closes what they stood on.
+    pub fn cut_narrow(&mut self) {
+        for _ in 0..NARROW_ROUNDS {
+            let Ok(twin) = topology::twins(&self.faces) else { return };
+            let narrow = narrow::narrow_vertices(&self.vertices, &self.faces, &twin);
+            let stays: Vec<bool> = self.faces.iter().map(|f| f.iter().all(|&v| !narrow[v as usize])).collect();
+            if stays.iter().all(|s| *s) {
+                return;
+            }
+            let mut rim = vec![false; self.vertices.len()];
+            for (face, _) in self.faces.iter().zip(&stays).filter(|(_, s)| !**s) {
+                face.iter().for_each(|&v| rim[v as usize] = true);
+            }
+            self.summary.narrow_faces_dropped += stays.iter().filter(|s| !**s).count();
+            let all = std::mem::take(&mut self.faces).into_iter().zip(std::mem::take(&mut self.observed));
+            (self.faces, self.observed) = all.zip(&stays).filter(|(_, s)| **s).map(|(both, _)| both).unzip();
+            // New vertices of split fans lie where their old ones do.
+            let rim: HashSet<[u64; 3]> =
+                rim.iter().zip(&self.vertices).filter(|(r, _)| **r).map(|(_, p)| bits(p)).collect();
+            self.summary.vertices_split += split_fans(&mut self.vertices, &mut self.faces);
+            self.keep_largest();
+            self.fill_holes(f64::INFINITY, |border| {
+                border.len() <= NARROW_RIM && border.iter().all(|p| rim.contains(&bits(p)))
+            });
+        }
+    }
+
     /// Cuts all handles open, keeping the largest component where a cut parts the surface.
     pub fn cut_handles(&mut self) {
         let left = |faces: &[[VertexId; 3]]| topology::twins(faces).map_or(0, |twin| handles::genus(faces, &twin));
@@ -269,6 +304,11 @@ impl Repaired {
         let (vertices, faces) = compact(self.vertices, self.faces);
         (Mesh::new(vertices, faces, self.observed).expect("repair keeps an oriented manifold"), self.summary)
     }
+}
+
+/// A place as something to compare exactly.
+fn bits(p: &Vec3) -> [u64; 3] {
+    [p.x, p.y, p.z].map(f64::to_bits)
 }
 
 /// Turns faces so that neighbours across an edge of two faces run through it in opposite directions; the first face of

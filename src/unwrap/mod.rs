@@ -35,6 +35,7 @@ mod start;
 mod stopping;
 mod triangle_shapes;
 pub mod unfold;
+mod unfurl;
 #[cfg(test)]
 pub(crate) mod closed_form;
 #[cfg(test)]

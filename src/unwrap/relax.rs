@@ -30,8 +30,8 @@
 //! solve is needed: a million faces relax in one go.
 //!
 //! Faces that are flipped at the start (the section chart could not be unfolded: caves, sharp bends) are pulled towards
-//! rigidity without the barrier, and the few that are flipped at the end are unfolded. Where that fails it starts again
-//! from an embedding in a rectangle, which has no flips, unfurled by steps of `slim`.
+//! rigidity without the barrier, and the few that are flipped at the end are unfolded, `unfurl`ed, and all is relaxed
+//! again. Where unfolding fails it starts anew from an embedding in a rectangle, which has no flips.
 //!
 //! Guarantees: no flips below `straightness` 1; there, u is exactly the chainage. Isometric on prisms; same bytes on any
 //! number of threads.
@@ -43,8 +43,10 @@ use super::flip_free_step::largest_flip_free_step;
 use super::guide::Guide;
 use super::quasi_newton::{Memory, advance, chunked_sum, dot};
 use super::rigid_fit::{rigid_density, rigid_slope};
+use super::start::start_without_flips;
 use super::triangle_shapes::{Shape, Shapes};
-use super::{Error, SolveSummary, distortion, slim};
+use super::unfurl::unfurl;
+use super::{Error, SolveSummary, distortion};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
 use crate::numeric::dissection::nested_dissection;
@@ -60,7 +62,7 @@ use serde::{Deserialize, Serialize};
 pub struct Settings {
     /// From 0 (as isometric as possible, the tunnel may curl) to 1 (u is exactly the chainage). Default 0.5.
     pub straightness: f64,
-    /// Most quasi-Newton steps. Default 60.
+    /// Most quasi-Newton steps; caves need more than tunnels. Default 200.
     pub max_iterations: usize,
     /// Done when a step lowers the energy by less than this share of it. Default 0.0005.
     pub tolerance: f64,
@@ -68,7 +70,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { straightness: 0.5, max_iterations: 60, tolerance: 5e-4 }
+        Self { straightness: 0.5, max_iterations: 200, tolerance: 5e-4 }
     }
 }
 
@@ -80,8 +82,6 @@ const BEARING_TIE: f64 = 0.25;
 const PLACE_TIE: f64 = 1e-7;
 /// The horizontal tie grows no further beyond this `straightness`: rough rock has no straight axis lines.
 const STRAIGHTEST: f64 = 0.95;
-/// Steps of `slim` that unfurl an embedding in a rectangle before the ties to the axis come in.
-const FIRST_STEPS: usize = 40;
 /// Steps that minimise the rigid energy first: it has no barrier, so needles in the start do not slow it down.
 const RIGID_STEPS: usize = 3;
 /// Share of the way to the first flip that a step may go.
@@ -108,12 +108,28 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
         summary.warnings.extend(shapes.warning());
         return Ok((uv, summary));
     }
+    let mesh = strip.mesh();
     finish(strip, &shapes, &mut uv, &mut summary);
-    if guide.summary().flipped_faces > 0 && distortion::flipped_faces(strip.mesh(), &uv).0 > 0 {
+    if summary.figures["faces_without_barrier"] == 0.0 {
+        return Ok((uv, summary));
+    }
+    let failed = |e: crate::numeric::sparse::Error| Error::Solve { method: "relax", what: e.to_string() };
+    if distortion::flipped_faces(mesh, &uv).0 > 0 {
         summary = SolveSummary::default();
-        let start = slim::without_flips("relax", strip, guide, &shapes, FIRST_STEPS, &mut summary)?;
-        uv = descend(strip, guide, &shapes, settings, start, &mut summary)?;
-        finish(strip, &shapes, &mut uv, &mut summary);
+        uv = start_without_flips("relax", strip, Some(guide), &shapes, &mut summary)?;
+    } else {
+        // Patches that were laid anew are squeezed.
+        let unfurled = unfurl(mesh, &shapes, &mut uv).map_err(failed)?;
+        summary = SolveSummary::default();
+        summary.figures.insert("unfurling_rounds".to_owned(), unfurled.rounds as f64);
+    }
+    let start = uv.clone();
+    uv = descend(strip, guide, &shapes, settings, uv, &mut summary)?;
+    finish(strip, &shapes, &mut uv, &mut summary);
+    if distortion::flipped_faces(mesh, &uv).0 > 0 {
+        // Needles have no barrier; better squeezed than flipped.
+        uv = start;
+        summary.converged = false;
     }
     Ok((uv, summary))
 }

@@ -91,25 +91,6 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     Ok((uv, summary))
 }
 
-/// A map without flips after a few iterations, for methods that go on from there.
-pub(super) fn without_flips(
-    method: &'static str,
-    strip: &Strip,
-    guide: &Guide,
-    shapes: &Shapes,
-    max_iterations: usize,
-    summary: &mut SolveSummary,
-) -> Result<Vec<Vec2>, Error> {
-    let mut uv = start_without_flips(method, strip, Some(guide), shapes, summary)?;
-    let mut own = SolveSummary::default();
-    let settings = Settings { max_iterations, ..Settings::default() };
-    minimize(strip.mesh(), shapes, &mut uv, &settings, &mut own)
-        .map_err(|e| Error::Solve { method, what: e.to_string() })?;
-    summary.figures.insert("unfurling_steps".to_owned(), own.iterations as f64);
-    summary.figures.extend(own.figures);
-    Ok(uv)
-}
-
 /// The iterations, from a map without flips.
 fn minimize(
     mesh: &Mesh,
@@ -118,8 +99,19 @@ fn minimize(
     settings: &Settings,
     summary: &mut SolveSummary,
 ) -> Result<(), sparse::Error> {
+    iterate(&mut WeightedSolver::new(mesh, shapes)?, mesh, shapes, uv, settings, summary)
+}
+
+/// [`minimize`] with a solver that was made for these shapes.
+pub(super) fn iterate(
+    solver: &mut WeightedSolver,
+    mesh: &Mesh,
+    shapes: &Shapes,
+    uv: &mut Vec<Vec2>,
+    settings: &Settings,
+    summary: &mut SolveSummary,
+) -> Result<(), sparse::Error> {
     let area = shapes.area();
-    let mut solver = WeightedSolver::new(mesh, shapes)?;
     let mut energy = dirichlet_energy(mesh.faces(), &shapes.shapes, uv) / area;
     summary.figures.insert("start_energy".to_owned(), energy);
     while summary.iterations < settings.max_iterations && !summary.converged {
@@ -218,12 +210,13 @@ fn gradient(corner_sums: &CornerSums, shapes: &[Shape], weights: &[FaceWeight]) 
 }
 
 /// Solves for the step of the weighted form.
-struct WeightedSolver {
+pub(super) struct WeightedSolver {
     edges: Pattern,
+    analysis: Analysis,
     corner_sums: CornerSums,
     proximal: f64,
     laplacian: Cholesky,
-    /// The 2x2 block form, made when the iterations fail for the first time.
+    /// The 2x2 block form, made when the iterations fail for the first time; from then on it alone is used.
     block: Option<(Pattern, Analysis)>,
     /// Conjugate gradient steps so far.
     steps: usize,
@@ -232,18 +225,34 @@ struct WeightedSolver {
 }
 
 impl WeightedSolver {
-    fn new(mesh: &Mesh, shapes: &Shapes) -> Result<Self, sparse::Error> {
-        let (faces, n) = (mesh.faces(), mesh.vertices().len());
-        let edges = Pattern::of_vertices(n, faces)?;
-        let mut values = super::conformal::cotangent_laplacian(&edges, faces, |f| shapes.shapes[f].cotangents());
-        let mean = (0..n).map(|j| values[edges.diagonal(j)]).sum::<f64>() / n.max(1) as f64;
-        let proximal = PROXIMAL * mean;
-        // An isometry has Q = 4.
-        values.iter_mut().for_each(|v| *v *= 4.0);
-        edges.add_to_diagonal(&mut values, |_| proximal);
-        let laplacian = Cholesky::of(&edges, &values)?;
-        let corner_sums = CornerSums::new(n, faces);
-        Ok(Self { edges, corner_sums, proximal, laplacian, block: None, steps: 0, factorizations: 0 })
+    pub fn new(mesh: &Mesh, shapes: &Shapes) -> Result<Self, sparse::Error> {
+        let n = mesh.vertices().len();
+        let edges = Pattern::of_vertices(n, mesh.faces())?;
+        let analysis = Analysis::new(&edges)?;
+        let (laplacian, proximal) = isometric_form(&edges, &analysis, mesh, shapes)?;
+        let corner_sums = CornerSums::new(n, mesh.faces());
+        Ok(Self { edges, analysis, corner_sums, proximal, laplacian, block: None, steps: 0, factorizations: 0 })
+    }
+
+    /// Factors the block form from now on.
+    pub fn directly(mut self) -> Result<Self, sparse::Error> {
+        self.make_block()?;
+        Ok(self)
+    }
+
+    fn make_block(&mut self) -> Result<(), sparse::Error> {
+        if self.block.is_none() {
+            let pattern = self.edges.two_per_node()?;
+            let analysis = Analysis::of_paired(&self.edges, &pattern)?;
+            self.block = Some((pattern, analysis));
+        }
+        Ok(())
+    }
+
+    /// The same solver for other shapes of the same faces.
+    pub fn take_shapes(&mut self, mesh: &Mesh, shapes: &Shapes) -> Result<(), sparse::Error> {
+        (self.laplacian, self.proximal) = isometric_form(&self.edges, &self.analysis, mesh, shapes)?;
+        Ok(())
     }
 
     /// The step `-H^-1 gradient / 2` with `H` the weighted form plus the proximal term.
@@ -296,11 +305,7 @@ impl WeightedSolver {
         weights: &[FaceWeight],
         right: &[Vec2],
     ) -> Result<Vec<Vec2>, sparse::Error> {
-        if self.block.is_none() {
-            let pattern = self.edges.two_per_node()?;
-            let analysis = Analysis::of_paired(&self.edges, &pattern)?;
-            self.block = Some((pattern, analysis));
-        }
+        self.make_block()?;
         let (pattern, analysis) = self.block.as_ref().expect("just made");
         let mut values = vec![0.0; pattern.entries()];
         let mut add = |i: u32, j: u32, k: f64, q: [f64; 3]| {
@@ -330,6 +335,23 @@ impl WeightedSolver {
         factor.solve_in_place(&mut x);
         Ok(x.chunks_exact(2).map(|p| Vec2::new(p[0], p[1])).collect())
     }
+}
+
+/// The form at an isometry with the proximal term, factored, and the weight of that term.
+fn isometric_form(
+    edges: &Pattern,
+    analysis: &Analysis,
+    mesh: &Mesh,
+    shapes: &Shapes,
+) -> Result<(Cholesky, f64), sparse::Error> {
+    let n = mesh.vertices().len();
+    let mut values = super::conformal::cotangent_laplacian(edges, mesh.faces(), |f| shapes.shapes[f].cotangents());
+    let mean = (0..n).map(|j| values[edges.diagonal(j)]).sum::<f64>() / n.max(1) as f64;
+    let proximal = PROXIMAL * mean;
+    // An isometry has Q = 4.
+    values.iter_mut().for_each(|v| *v *= 4.0);
+    edges.add_to_diagonal(&mut values, |_| proximal);
+    Ok((Cholesky::new(edges, analysis, &values)?, proximal))
 }
 
 #[cfg(test)]

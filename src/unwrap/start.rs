@@ -5,18 +5,25 @@ use super::guide::Guide;
 use super::rigid_fit::chart_area;
 use super::triangle_shapes::Shapes;
 use super::unfold::{Unfolded, unfold};
+use super::unfurl::unfurl;
 use super::{Error, SolveSummary};
 use crate::cut::Strip;
 use crate::mesh::Mesh;
+use crate::numeric::sparse::{self, Analysis, Cholesky, Pattern};
 use crate::numeric::{Vec2, Vec3};
-use crate::numeric::sparse::{self, Cholesky, Pattern};
 use crate::warning::Warning;
+use rayon::prelude::*;
 use std::f64::consts::TAU;
 
 /// How far the sides of the rectangle bulge, as a share of their length.
 const BULGE: f64 = 0.02;
 /// Edges count as at least this long, as a share of a typical one.
 const SHORTEST: f64 = 1e-3;
+/// How often the springs of an embedding are softened at most, and by how much at once.
+const SOFTENINGS: usize = 20;
+const MOST_SOFTENING: f64 = 30.0;
+/// Softening ends when the energy of what is squeezed falls by less than this.
+const MUST_GAIN: f64 = 0.95;
 
 /// The start of a method that bears flips: the section chart, or the pinned conformal map scaled to the surface's area.
 pub(super) fn start(
@@ -60,7 +67,7 @@ pub(super) fn start_without_flips(
     if unfolded.flipped_after == 0 {
         return Ok(uv);
     }
-    let failed = |e: sparse::Error| Error::Solve { method, what: format!("Tutte's embedding: {e}") };
+    let failed = |e: sparse::Error| Error::Solve { method, what: format!("start from Tutte's embedding: {e}") };
     let in_rectangle = guide.map(|guide| in_rectangle(strip, guide)).transpose().map_err(failed)?.flatten();
     let figure = if in_rectangle.is_some() { "a rectangle" } else { "a disk" };
     summary.warnings.push(Warning::new(
@@ -74,10 +81,13 @@ pub(super) fn start_without_flips(
     uv = in_rectangle.map_or_else(|| tutte(strip, shapes), Ok).map_err(failed)?;
     // Rounding folds faces that the embedding squeezes to nearly nothing; they are few and lie apart.
     let still = unfold(mesh, &mut uv).flipped_after;
-    match still {
-        0 => Ok(uv),
-        _ => Err(Error::Solve { method, what: format!("no start without flips: {still} faces are flipped in Tutte's embedding") }),
+    if still > 0 {
+        let what = format!("no start without flips: {still} faces are flipped in Tutte's embedding");
+        return Err(Error::Solve { method, what });
     }
+    let unfurled = unfurl(mesh, shapes, &mut uv).map_err(failed)?;
+    summary.figures.insert("unfurling_rounds".to_owned(), unfurled.rounds as f64);
+    Ok(uv)
 }
 
 /// The conformal map with two far boundary vertices held, scaled to the area of the surface.
@@ -125,14 +135,11 @@ fn in_rectangle(strip: &Strip, guide: &Guide) -> Result<Option<Vec<Vec2>>, spars
         (0..rim.len()).max_by(|&a, &b| score(a).total_cmp(&score(b)).then(b.cmp(&a))).expect("a rim has vertices")
     };
     let corners = sides.map(corner);
-    let lengths: [usize; 4] =
-        std::array::from_fn(|i| (corners[(i + 1) % 4] + rim.len() - corners[i]) % rim.len());
+    let lengths: [usize; 4] = std::array::from_fn(|i| (corners[(i + 1) % 4] + rim.len() - corners[i]) % rim.len());
     if lengths.contains(&0) || lengths.iter().sum::<usize>() != rim.len() {
         return Ok(None);
     }
-    let place = |(along, around): (f64, f64)| {
-        Vec2::new(if along > 0.0 { high } else { low }, 0.5 * girth * around)
-    };
+    let place = |(along, around): (f64, f64)| Vec2::new(if along > 0.0 { high } else { low }, 0.5 * girth * around);
     let mut places = vec![Vec2::zeros(); rim.len()];
     for i in 0..4 {
         let side: Vec<u32> = (0..=lengths[i]).map(|k| rim[(corners[i] + k) % rim.len()]).collect();
@@ -162,8 +169,13 @@ fn shares_along(mesh: &Mesh, chain: &[u32]) -> Vec<f64> {
 }
 
 /// Tutte's embedding (W. T. Tutte, "How to draw a graph", Proc. London Math. Soc. 13, 1963, doi:10.1112/plms/s3-13.1.743)
-/// inside given places of the outer loop, which have to be convex: every other vertex in the mean of its neighbours,
-/// weighted by 1 / edge length. Holes count as filled by one vertex each, so that the graph is that of a disk.
+/// inside given places of the outer loop, which have to be convex: every other vertex in the weighted mean of its
+/// neighbours. Holes count as filled by one vertex each, so that the graph is that of a disk.
+///
+/// Springs start with weights 1 / edge length and are weakened again and again where the map squeezes the surface (S.
+/// Yoshizawa, A. Belyaev, H.-P. Seidel, "A fast and simple stretch-minimizing mesh parameterization", SMI 2004,
+/// doi:10.1109/SMI.2004.1314507): any positive weights give a map without flips. Departure: both ends of a spring share in its
+/// weakening, so that the matrix stays symmetric, and squeezing is told by areas.
 fn embedded(strip: &Strip, places: &[Vec2]) -> Result<Vec<Vec2>, sparse::Error> {
     let (mesh, rim) = (strip.mesh(), strip.outer_loop());
     let n = mesh.vertices().len();
@@ -183,26 +195,62 @@ fn embedded(strip: &Strip, places: &[Vec2]) -> Result<Vec<Vec2>, sparse::Error> 
     }
     let edges = || mesh.faces().iter().flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)]).chain(spokes.iter().copied());
     let pattern = Pattern::of_pairs(total, edges)?;
-    // Weights that differ by more than this would be lost in rounding.
+    let analysis = Analysis::new(&pattern)?;
     let shortest_m = SHORTEST * (mesh.area() / mesh.faces().len() as f64).sqrt();
-    let mut values = vec![0.0; pattern.entries()];
-    for j in 0..total {
-        for (k, &i) in pattern.column(j).iter().enumerate().skip(1) {
-            let weight = 1.0 / (points[i as usize] - points[j]).norm().max(shortest_m);
-            values[pattern.diagonal(j) + k] = -weight;
-            values[pattern.diagonal(j)] += weight;
-            values[pattern.diagonal(i as usize)] += weight;
+    let mut softness = vec![1.0; total];
+    let mut best: Option<(f64, Vec<Vec2>)> = None;
+    for _ in 0..SOFTENINGS {
+        let mut values = vec![0.0; pattern.entries()];
+        for j in 0..total {
+            for (k, &i) in pattern.column(j).iter().enumerate().skip(1) {
+                let i = i as usize;
+                let length = (points[i] - points[j]).norm().max(shortest_m);
+                let weight = 1.0 / (length * f64::sqrt(softness[i] * softness[j]));
+                values[pattern.diagonal(j) + k] = -weight;
+                values[pattern.diagonal(j)] += weight;
+                values[pattern.diagonal(i)] += weight;
+            }
         }
+        let mut free = values.clone();
+        let mut x = vec![0.0; total];
+        let mut y = vec![0.0; total];
+        pattern.fix_unknowns(&mut values, &mut x, |j| fixed[j].map(|p| p.x));
+        pattern.fix_unknowns(&mut free, &mut y, |j| fixed[j].map(|p| p.y));
+        let factor = Cholesky::new(&pattern, &analysis, &values)?;
+        let x = factor.solve_refined(&pattern, &values, &x);
+        let y = factor.solve_refined(&pattern, &values, &y);
+        let uv: Vec<Vec2> = (0..n).map(|v| Vec2::new(x[v], y[v])).collect();
+        let squeezed = squeezing(mesh, &uv);
+        let energy = squeezed.iter().map(|&(area, squeeze)| area * squeeze * squeeze).sum::<f64>();
+        if best.as_ref().is_some_and(|(least, _)| energy > MUST_GAIN * least) {
+            break;
+        }
+        let mut sums = vec![(0.0, 0.0); n];
+        for (corners, &(area, squeeze)) in mesh.faces().iter().zip(&squeezed) {
+            for &v in corners {
+                sums[v as usize].0 += area * squeeze;
+                sums[v as usize].1 += area;
+            }
+        }
+        for (soft, (sum, area)) in softness.iter_mut().zip(sums).filter(|(_, s)| s.1 > 0.0) {
+            *soft *= (sum / area).clamp(1.0 / MOST_SOFTENING, MOST_SOFTENING);
+        }
+        best = Some((energy, uv));
     }
-    let mut free = values.clone();
-    let mut x = vec![0.0; total];
-    let mut y = vec![0.0; total];
-    pattern.fix_unknowns(&mut values, &mut x, |j| fixed[j].map(|p| p.x));
-    pattern.fix_unknowns(&mut free, &mut y, |j| fixed[j].map(|p| p.y));
-    let factor = Cholesky::of(&pattern, &values)?;
-    let x = factor.solve_refined(&pattern, &values, &x);
-    let y = factor.solve_refined(&pattern, &values, &y);
-    Ok((0..n).map(|v| Vec2::new(x[v], y[v])).collect())
+    Ok(best.expect("the first map is taken").1)
+}
+
+/// For each face its area on the surface, and the square root of how many times smaller it is on the map.
+fn squeezing(mesh: &Mesh, uv: &[Vec2]) -> Vec<(f64, f64)> {
+    (0..mesh.faces().len() as u32)
+        .into_par_iter()
+        .map(|f| {
+            let area = mesh.double_area_vector(f).norm() / 2.0;
+            let [a, b, c] = mesh.faces()[f as usize].map(|v| uv[v as usize]);
+            let on_map = ((b - a).perp(&(c - a)) / 2.0).max(area * 1e-20).max(f64::MIN_POSITIVE);
+            (area, (area / on_map).sqrt())
+        })
+        .collect()
 }
 
 #[cfg(test)]
