@@ -367,3 +367,12 @@ fn bad_input_is_told_in_one_line() {
         }
     }
 }
+
+#[test]
+fn gps_times_that_call_the_decoder_again_and_again_do_not_end_the_program() {
+    // Found by fuzzing: a damaged layer makes the decoder change between its sequences some 30,000 times for one point.
+    for options in [&["info"][..], &["info", "--json"], &["info", "--threads", "1"]] {
+        let output = adit(&[options, &["tests/damaged/gps_time_sequences.laz"]].concat());
+        assert!(matches!(output.status.code(), Some(0 | 3)), "{:?}: {}", output.status, text(&output));
+    }
+}

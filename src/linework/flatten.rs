@@ -323,6 +323,21 @@ mod tests {
     }
 
     #[test]
+    fn a_line_across_the_seam_loses_next_to_nothing_there() {
+        let width = std::f64::consts::TAU;
+        let chart = bent_chart(4.0, width, 61, 91, |u, v| Vec3::new(u, -v.sin(), v.cos()));
+        let (index, anchoring) = (ChartIndex::of(&chart), Anchoring::of(chart.strip().mesh()));
+        let at = |s: f64, angle: f64| Vec3::new(s, -angle.sin(), angle.cos());
+        let across = line(1, vec![vec![at(1.0, -0.13), at(1.3, 0.2)]]);
+        let flat = flatten(&index, &anchoring, &[across], &FlattenSettings::default()).unwrap();
+        assert_eq!((flat.summary.splits, flat.features[0].parts.len()), (1, 2), "{:?}", flat.summary);
+        let back = drape(&index, &flat.features).unwrap();
+        let parts = &back.features[0].parts;
+        let gap = (parts[0][parts[0].len() - 1] - parts[1][0]).norm();
+        assert!(gap < 1e-5, "{gap}");
+    }
+
+    #[test]
     fn what_has_no_place_is_told() {
         let chart = wavy();
         let (index, anchoring) = (ChartIndex::of(&chart), Anchoring::of(chart.strip().mesh()));
