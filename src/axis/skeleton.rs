@@ -15,6 +15,8 @@ use std::collections::{BTreeMap, BinaryHeap};
 
 /// A void's contact with the outside is a portal when it is at least this share of the mean section.
 const PORTAL_SHARE: f64 = 0.3;
+/// A portal has at most this many times the cells of the mean section.
+const LARGEST_PORTAL: f64 = 2.0;
 /// A dead end counts as the tunnel's end, instead of the farthest portal, when it is this much farther.
 const DEAD_END_PREFERENCE: f64 = 1.5;
 /// Shorter side spaces than this many clearances are niches.
@@ -126,13 +128,24 @@ fn mean_distance(distance: &[f64], group: &[usize]) -> f64 {
 }
 
 /// The end of the tunnel farthest from where `distance` is measured: a portal, or a dead end if that is much farther.
-fn far_end(distance: &[f64], portals: &[Vec<usize>], from: Option<usize>) -> (Vec<usize>, Option<usize>) {
+/// `section_cells` is the number of cells of a usual section.
+fn far_end(
+    distance: &[f64],
+    portals: &[Vec<usize>],
+    section_cells: f64,
+    from: Option<usize>,
+) -> (Vec<usize>, Option<usize>) {
     let dead_end = farthest(distance, 0..distance.len());
     let portal = (0..portals.len())
         .filter(|&p| Some(p) != from)
         .max_by(|&a, &b| mean_distance(distance, &portals[a]).total_cmp(&mean_distance(distance, &portals[b])));
-    // The far corner of a wide portal is no dead end.
-    let reach = |p: usize| portals[p].iter().map(|&r| distance[r]).fold(0.0, f64::max);
+    // The far corner of a wide portal is no dead end; walls full of gaps are no portal.
+    let reach = |p: usize| match &portals[p] {
+        portal if portal.len() as f64 <= LARGEST_PORTAL * section_cells => {
+            portal.iter().map(|&r| distance[r]).fold(0.0, f64::max)
+        }
+        portal => mean_distance(distance, portal),
+    };
     match portal {
         Some(p) if reach(p) * DEAD_END_PREFERENCE >= distance[dead_end] => (portals[p].clone(), Some(p)),
         _ => (vec![dead_end], None),
@@ -167,8 +180,8 @@ pub(super) fn skeleton(void: &EnclosedVoid, ends: Option<[Vec3; 2]>) -> Skeleton
             Some(p) => (portals[p].clone(), Some(p)),
             None => (vec![farthest(&first, 0..first.len())], None),
         };
-        let (one, one_portal) = far_end(&distances(void, &seed), &portals, seed_portal);
-        let (other, other_portal) = far_end(&distances(void, &one), &portals, one_portal);
+        let (one, one_portal) = far_end(&distances(void, &seed), &portals, section_cells, seed_portal);
+        let (other, other_portal) = far_end(&distances(void, &one), &portals, section_cells, one_portal);
         (one, one_portal, other, other_portal)
     };
 

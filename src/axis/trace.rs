@@ -775,8 +775,16 @@ mod tests {
             furniture: vec![],
             ..Recipe::default()
         };
-        let (length, angle) = length_and_angle(&recipe);
-        assert!((9.0..13.0).contains(&length) && angle < 25.0, "length {length:.2} m, {angle:.1} degrees off");
+        let tunnel = recipe.tunnel().unwrap();
+        let scan = scan(&tunnel, &recipe.plan().unwrap()).unwrap();
+        let (geometry, _) = clean::clean(&scan.cloud, &clean::Settings::default()).unwrap();
+        let (axis, summary) = trace(geometry.positions(), &Settings::default()).unwrap();
+        assert!(summary.warnings.iter().any(|w| w.code == "sharp-bend"), "{:?}", summary.warnings);
+        let frames: Vec<_> =
+            (0..=20).map(|i| axis.frame_at(axis.start_chainage() + axis.length() * f64::from(i) / 20.0)).collect();
+        let turn = frames[0].forward.angle(&frames[20].forward).to_degrees();
+        let off = frames.iter().map(|f| tunnel.axis().project(&f.origin).radius()).fold(0.0, f64::max);
+        assert!(turn > 60.0 && off < 1.0, "turns {turn:.0} degrees, {off:.2} m off");
     }
 
     #[test]
