@@ -514,7 +514,8 @@ struct SharpBend {
     length_m: f64,
 }
 
-/// The middle of the void as the axis, if the refined one misses a portal because the tunnel bends too sharply for sections.
+/// The middle of the void as the axis, if the refined one misses a portal, strays from the rough path or runs through rock,
+/// because the tunnel bends too sharply for sections.
 fn sharp_bend(
     skeleton: &Skeleton,
     void: &EnclosedVoid,

@@ -33,7 +33,8 @@
 //! rigidity without the barrier, and the few that are flipped at the end are unfolded, `unfurl`ed, and all is relaxed
 //! again. Where unfolding fails it starts anew from an embedding in a rectangle, which has no flips.
 //!
-//! Guarantees: no flips below `straightness` 1; there, u is exactly the chainage. Isometric on prisms; same bytes on any
+//! Guarantees: no flips below `straightness` 1, unless a warning tells that no start without flips was found; there, u is
+//! exactly the chainage. Isometric on prisms; same bytes on any
 //! number of threads.
 //! Cost: two factorizations (about 1 s a million faces together) and 0.2 s a step and million faces.
 
@@ -52,6 +53,7 @@ use crate::mesh::Mesh;
 use crate::numeric::dissection::nested_dissection;
 use crate::numeric::sparse::{Analysis, Cholesky, Pattern};
 use crate::numeric::{Mat2, Vec2};
+use crate::warning::Warning;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -113,25 +115,43 @@ pub fn flatten(strip: &Strip, guide: Option<&Guide>, settings: &Settings) -> Res
     if summary.figures["faces_without_barrier"] == 0.0 {
         return Ok((uv, summary));
     }
-    let failed = |e: crate::numeric::sparse::Error| Error::Solve { method: "relax", what: e.to_string() };
-    if distortion::flipped_faces(mesh, &uv).0 > 0 {
-        summary = SolveSummary::default();
-        uv = start_without_flips("relax", strip, Some(guide), &shapes, &mut summary)?;
+    let mut again = SolveSummary::default();
+    let start = if distortion::flipped_faces(mesh, &uv).0 > 0 {
+        start_without_flips("relax", strip, Some(guide), &shapes, &mut again)
     } else {
         // Patches that were laid anew are squeezed.
-        let unfurled = unfurl(mesh, &shapes, &mut uv).map_err(failed)?;
-        summary = SolveSummary::default();
-        summary.figures.insert("unfurling_rounds".to_owned(), unfurled.rounds as f64);
-    }
-    let start = uv.clone();
-    uv = descend(strip, guide, &shapes, settings, uv, &mut summary)?;
-    finish(strip, &shapes, &mut uv, &mut summary);
-    if distortion::flipped_faces(mesh, &uv).0 > 0 {
+        let mut start = uv.clone();
+        unfurl(mesh, &shapes, &mut start)
+            .map(|unfurled| {
+                again.figures.insert("unfurling_rounds".to_owned(), unfurled.rounds as f64);
+                start
+            })
+            .map_err(|e| Error::Solve { method: "relax", what: e.to_string() })
+    };
+    let start = match start {
+        Ok(start) => start,
+        Err(why) => {
+            summary
+                .warnings
+                .push(Warning::new("not-relaxed-again", format!("{why}; the map is that of the first solve")));
+            return Ok((uv, summary));
+        }
+    };
+    let mut relaxed = descend(strip, guide, &shapes, settings, start.clone(), &mut again)?;
+    finish(strip, &shapes, &mut relaxed, &mut again);
+    let flipped = distortion::flipped_faces(mesh, &relaxed).0;
+    if flipped > 0 {
         // Needles have no barrier; better squeezed than flipped.
-        uv = start;
-        summary.converged = false;
+        again.converged = false;
+        again.warnings.push(Warning::new(
+            "start-kept",
+            format!(
+                "the solve flipped {flipped} faces for good, so the map is its start: free of flips, but not relaxed"
+            ),
+        ));
+        relaxed = start;
     }
-    Ok((uv, summary))
+    Ok((relaxed, again))
 }
 
 /// The quasi-Newton steps from a start.
