@@ -539,6 +539,32 @@ mod tests {
     }
 
     #[test]
+    fn the_method_follows_what_hides_and_whether_it_can_be_opened() {
+        // A boulder of 1.1 m on the floor that holds three times the points of the walls.
+        let mut points = drift();
+        points.retain(|p| p.y < 2.1);
+        let count = 3 * points.len();
+        points.extend((0..count).map(|i| {
+            let z = 1.0 - 2.0 * (i as f64 + 0.5) / count as f64;
+            let (sin, cos) = (2.399_963_229_728_653 * i as f64).sin_cos();
+            let r = (1.0 - z * z).sqrt();
+            Vec3::new(10.0, 0.0, -1.0) + Vec3::new(r * cos, r * sin, z) * 1.1
+        }));
+        let (segmentation, _) = classify_positions(&points, &axis(), &segment::Settings::default()).unwrap();
+        let with = |method| reconstruct(&segmentation, &axis(), &Settings { method, ..Settings::default() }).unwrap();
+        let (_, set) = with(Method::Section);
+        assert_eq!(set.method, "section");
+        let (mesh, mut summary) = with(Method::Auto);
+        assert_eq!(summary.method, "poisson", "{}", summary.reason);
+        assert!(summary.reason.contains("stand in front"), "{}", summary.reason);
+        assert_eq!(cannot_be_opened(&mesh, &summary, &axis(), &segmentation), None);
+        summary.repair.as_mut().unwrap().handle_cuts_m = 100.0;
+        assert!(cannot_be_opened(&mesh, &summary, &axis(), &segmentation).unwrap().contains("100 m"));
+        let (plain, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
+        assert_eq!(reconstruct(&plain, &axis(), &Settings::default()).unwrap().1.method, "section");
+    }
+
+    #[test]
     fn profiles_half_a_metre_apart_make_one_poisson_surface() {
         // 41 profiles of 1200 points each: 1 cm around, 50 cm along.
         let points: Vec<Vec3> = (0..41 * 1200)
