@@ -5,6 +5,7 @@ use super::error::Error;
 use super::file_scan::{FileInfo, FileScan, Settings};
 use super::guards::{self, PointGuards};
 use super::part::Part;
+use super::point_table::MID_GREY;
 use super::poses::Poses;
 use super::source_bytes::SourceBytes;
 use super::stations::{self, StationOverlap};
@@ -281,8 +282,7 @@ impl Whole {
         let first_station = self.scan.stations.len() as u16;
         let mine = &mut self.scan.attributes;
         let context = Append { before, added, path };
-        const GREY: [u16; 3] = [0x8080; 3];
-        context.column("colours", &mut mine.colors, attributes.colors, GREY, Some("mid grey"), warnings);
+        context.column("colours", &mut mine.colors, attributes.colors, MID_GREY, Some("mid grey"), warnings);
         context.column("intensities", &mut mine.intensities, attributes.intensities, 0, Some("0"), warnings);
         context.column("classes", &mut mine.classifications, attributes.classifications, 0, None, warnings);
         context.column("source ids", &mut mine.source_ids, attributes.source_ids, 0, None, warnings);

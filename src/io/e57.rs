@@ -9,7 +9,7 @@ use super::crs;
 use super::error::{COPY_AGAIN, Error};
 use super::file_scan::{AttributeInfo, FileInfo, FileScan, Settings};
 use super::label_column::LabelSource;
-use super::point_table::{ColorRange, PointTable, Roles};
+use super::point_table::{ColorRange, MID_GREY, PointTable, Roles, mixed_scans};
 use super::source_bytes::SourceBytes;
 use crate::cloud::Station;
 use crate::numeric::Vec3;
@@ -68,13 +68,14 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
             check_pose(index, cloud, &mut warnings);
             let own = OwnRange::of(&mut reader, source, index, cloud)?;
             warnings.extend(own.told(index));
+            let no_color = if cloud.has_color() { [0.0; 3] } else { MID_GREY.map(|c| f64::from(c) / 65535.0) };
             each_point(&mut reader, source, index, cloud, &own, |point| {
                 let mut values = [f64::NAN; 7];
                 if let CartesianCoordinate::Valid { x, y, z } = point.cartesian {
                     (values[0], values[1], values[2]) = (x, y, z);
                 }
-                // What has no valid colour or intensity shows as black.
-                let color = point.color.map_or([0.0; 3], |c| [c.red, c.green, c.blue].map(|c| own.color(c)));
+                // What has no valid colour or intensity shows as black, in a scan without any as grey.
+                let color = point.color.map_or(no_color, |c| [c.red, c.green, c.blue].map(|c| own.color(c)));
                 values[3..6].copy_from_slice(&color);
                 values[6] = point.intensity.map_or(0.0, |i| own.intensity(i));
                 slots[0].set(row, &roles, &mut 0, |column| values[column]);
@@ -86,6 +87,8 @@ pub(super) fn read(source: &SourceBytes, settings: &Settings, origin: Option<Vec
     if row as u64 != total {
         return Err(Error::bad(path, format!("its scans promise {total} points, but hold {row}"), COPY_AGAIN));
     }
+    warnings.extend(mixed_scans("colours", "mid grey", clouds.iter().map(PointCloud::has_color)));
+    warnings.extend(mixed_scans("intensities", "0", clouds.iter().map(PointCloud::has_intensity)));
     for (name, there) in [("color", colored), ("intensity", gray)] {
         info.attributes.extend(there.then(|| AttributeInfo::present(name)));
     }

@@ -107,6 +107,9 @@ fn index(word: Option<&str>, count: usize) -> Option<usize> {
 /// Object File Format with its prefixes (`COFF`, `NOFF`, ...) and comments.
 pub(super) fn off(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     let bytes = source.up_to(0, usize::MAX)?;
+    if let Some((prefix, data)) = binary_off_head(&bytes) {
+        return binary_off(source, prefix, data);
+    }
     let text = String::from_utf8_lossy(&bytes);
     let mut lines = text
         .lines()
@@ -124,9 +127,6 @@ pub(super) fn off(source: &SourceBytes) -> Result<MeshBuilder, Error> {
     }
     if !counts_first {
         head = head[prefix_end..].trim();
-    }
-    if head.starts_with("BINARY") {
-        return Err(Error::unsupported(source.path(), "binary OFF", "save it as text OFF or PLY"));
     }
     if head.is_empty() {
         (line, head) = lines.next().ok_or_else(ended)?;
@@ -157,6 +157,59 @@ pub(super) fn off(source: &SourceBytes) -> Result<MeshBuilder, Error> {
             return Err(at_line(source, n, text, "has fewer corners than it says"));
         }
         builder.polygon(&corners, None).map_err(|e| at_line(source, n, text, &e))?;
+    }
+    Ok(builder)
+}
+
+/// Prefix of the keyword and what follows the first line, if that says `OFF BINARY`.
+fn binary_off_head(bytes: &[u8]) -> Option<(&str, &[u8])> {
+    let end = bytes.iter().take(100).position(|&b| b == b'\n')?;
+    let mut head = words(std::str::from_utf8(&bytes[..end]).ok()?);
+    let prefix = head.next()?.strip_suffix("OFF")?;
+    (head.next() == Some("BINARY")).then_some((prefix, &bytes[end + 1..]))
+}
+
+/// OFF whose numbers are big-endian, 32 bits each: counts, vertices with what the prefix adds to them, and for each face its
+/// corners and the channels of its colour (Geomview manual, "Object File Format").
+fn binary_off(source: &SourceBytes, prefix: &str, data: &[u8]) -> Result<MeshBuilder, Error> {
+    let extra = match prefix {
+        "" => 0,
+        "ST" => 2,
+        "N" => 3,
+        "C" => 4,
+        "STN" => 5,
+        "STC" => 6,
+        "CN" => 7,
+        "STCN" => 9,
+        _ => {
+            return Err(Error::unsupported(source.path(), format!("binary {prefix}OFF"), "save it as PLY"));
+        }
+    };
+    let mut numbers = data.as_chunks::<4>().0.iter().copied();
+    let ended = || Error::bad(source.path(), "it ends too early", COPY_AGAIN);
+    let mut take = || numbers.next().ok_or_else(ended);
+    let [vertices, faces, _edges] = [take()?, take()?, take()?].map(u32::from_be_bytes);
+    let mut builder = MeshBuilder::new("OFF");
+    builder.single_precision = true;
+    for _ in 0..vertices {
+        let [x, y, z] = [take()?, take()?, take()?].map(|b| f64::from(f32::from_be_bytes(b)));
+        builder.vertices.push(Vec3::new(x, y, z));
+        for _ in 0..extra {
+            take()?;
+        }
+    }
+    let mut corners = Vec::new();
+    for face in 0..faces {
+        corners.clear();
+        for _ in 0..u32::from_be_bytes(take()?) {
+            corners.push(f64::from(u32::from_be_bytes(take()?)));
+        }
+        for _ in 0..u32::from_be_bytes(take()?) {
+            take()?;
+        }
+        builder
+            .polygon(&corners, None)
+            .map_err(|cause| Error::bad(source.path(), format!("face {face} {cause}"), COPY_AGAIN))?;
     }
     Ok(builder)
 }

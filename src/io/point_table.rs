@@ -75,12 +75,30 @@ impl Roles {
     }
 }
 
+/// Colour of points that have none beside points that have one.
+pub(super) const MID_GREY: [u16; 3] = [0x8080; 3];
+
 /// Says how many records gave no point.
 pub(super) fn dropped(count: u64, of: u64, first: u64, reason: &str) -> Warning {
     Warning::new(
         "dropped-points",
         format!("{count} of {of} points have {reason} and are dropped (the first is record {first})"),
     )
+}
+
+/// Says which scans of a file lack what others have.
+pub(super) fn mixed_scans(name: &str, filled_with: &str, has: impl Iterator<Item = bool>) -> Option<Warning> {
+    let has: Vec<bool> = has.collect();
+    let without: Vec<usize> = (0..has.len()).filter(|&i| !has[i]).map(|i| i + 1).collect();
+    (!without.is_empty() && without.len() < has.len()).then(|| {
+        let text = format!(
+            "{} of its {} scans (the first is scan {}) have no {name}; their points are {filled_with}",
+            without.len(),
+            has.len(),
+            without[0]
+        );
+        Warning::new("mixed-attributes", text)
+    })
 }
 
 /// Columns being filled.
@@ -157,20 +175,26 @@ impl PointTable {
         self.bad_labels += count;
     }
 
-    /// Appends the rows of another table with the same roles.
+    /// Appends the rows of another table; a column that only one of them has is mid grey or zero in the rows of the other.
     pub(super) fn append(&mut self, other: Self) {
-        fn join<T>(mine: &mut Option<Vec<T>>, theirs: Option<Vec<T>>) {
-            if let (Some(mine), Some(theirs)) = (mine.as_mut(), theirs) {
-                mine.extend(theirs);
+        let rows = [self.len(), other.len()];
+        fn join<T: Clone>(mine: &mut Option<Vec<T>>, theirs: Option<Vec<T>>, fill: T, rows: [usize; 2]) {
+            if mine.is_none() && theirs.is_none() {
+                return;
+            }
+            let column = mine.get_or_insert_with(|| vec![fill.clone(); rows[0]]);
+            match theirs {
+                Some(theirs) => column.extend(theirs),
+                None => column.resize(rows[0] + rows[1], fill),
             }
         }
         self.positions.extend(other.positions);
-        join(&mut self.colors, other.colors);
-        join(&mut self.open_colors, other.open_colors);
-        join(&mut self.intensities, other.intensities);
-        join(&mut self.classifications, other.classifications);
-        join(&mut self.source_ids, other.source_ids);
-        join(&mut self.labels, other.labels);
+        join(&mut self.colors, other.colors, MID_GREY, rows);
+        join(&mut self.open_colors, other.open_colors, MID_GREY.map(|c| f32::from(c) / 65535.0), rows);
+        join(&mut self.intensities, other.intensities, 0.0, rows);
+        join(&mut self.classifications, other.classifications, 0, rows);
+        join(&mut self.source_ids, other.source_ids, 0, rows);
+        join(&mut self.labels, other.labels, 0, rows);
         self.bad_labels += other.bad_labels;
     }
 

@@ -81,6 +81,19 @@ fn ptx_lines_of_three_to_ten_numbers() {
 }
 
 #[test]
+fn ptx_scans_with_and_without_colours_become_one_cloud() {
+    let text = [ptx("1 2 3 0.5\n4 5 6 0.6\n"), ptx("1 2 3 10 20 30\n4 5 6 0 255 7\n")].concat();
+    let (cloud, summary) = scan("a.ptx", text.trim_ascii_start());
+    let attributes = cloud.attributes();
+    assert_eq!(attributes.colors.as_deref().unwrap()[..3], [[0x8080; 3], [0x8080; 3], [2570, 5140, 7710]]);
+    let intensities = attributes.intensities.as_deref().unwrap();
+    assert!(intensities[0] > 0 && intensities[1] > intensities[0] && intensities[2..] == [0, 0], "{intensities:?}");
+    let mixed: Vec<&str> =
+        summary.warnings.iter().filter(|w| w.code == "mixed-attributes").map(|w| w.message.as_str()).collect();
+    assert!(mixed.len() == 2 && mixed[0].contains("scan 2") && mixed[1].contains("mid grey"), "{mixed:?}");
+}
+
+#[test]
 fn pcd_headers_that_disagree_are_told() {
     let header = "VERSION .6\nCOLUMNS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 7\nHEIGHT 3\nVIEWPOINT nan 0 0\nPOINTS 2\n";
     let (cloud, summary) = scan("a.pcd", format!("{header}DATA ascii\n1 2 3\n4 5 6\n").as_bytes());
@@ -132,6 +145,27 @@ fn e57_values_without_limits_keep_their_ratios() {
     let colors = cloud.attributes().colors.as_deref().unwrap();
     assert_eq!(colors, [[65_535, 0, 26_214], [0, 0, 26_214], [13_107, 0, 26_214]]);
     assert!(summary.warnings.iter().any(|w| w.code == "intensity-range"), "{:?}", summary.warnings);
+}
+
+#[test]
+fn an_e57_scan_without_colours_is_grey_beside_one_with_colours() {
+    use ::e57::{E57Writer, Record, RecordValue};
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.e57");
+    let mut writer = E57Writer::from_file(&path, "file").unwrap();
+    let place = vec![Record::CARTESIAN_X_F64, Record::CARTESIAN_Y_F64, Record::CARTESIAN_Z_F64];
+    let colored = [place.clone(), vec![Record::COLOR_RED_U8, Record::COLOR_GREEN_U8, Record::COLOR_BLUE_U8]].concat();
+    for (prototype, color) in [(colored, vec![255, 0, 51]), (place, vec![])] {
+        let mut points = writer.add_pointcloud("scan", prototype).unwrap();
+        let place = [1.0, 2.0, 3.0].map(RecordValue::Double).to_vec();
+        points.add_point([place, color.into_iter().map(RecordValue::Integer).collect()].concat()).unwrap();
+        points.finalize().unwrap();
+    }
+    writer.finalize().unwrap();
+    let (cloud, summary) = read(&path);
+    assert_eq!(cloud.attributes().colors.as_deref(), Some(&[[65_535, 0, 13_107], [0x8080; 3]][..]));
+    let told = summary.warnings.iter().find(|w| w.code == "mixed-attributes");
+    assert!(told.is_some_and(|w| w.message.contains("scan 2")), "{:?}", summary.warnings);
 }
 
 /// A GLB with one primitive of `mode` over the corners of a square, shown by `copies` nodes.

@@ -215,6 +215,22 @@ fn mesh_formats_agree() {
         let (b, _) = mesh(name, text.as_bytes()).unwrap();
         assert_eq!((&b.vertices, &b.faces), (&a.vertices, &a.faces), "{name}");
     }
+    let number = |n: f32| n.to_be_bytes();
+    let count = |n: u32| n.to_be_bytes();
+    let mut off = b"COFF BINARY\n".to_vec();
+    off.extend([4, 1, 0].map(count).concat());
+    for v in &a.vertices {
+        off.extend([v.x as f32, v.y as f32, v.z as f32, 0.5, 0.5, 0.5, 1.0].map(number).concat());
+    }
+    off.extend([4, 0, 1, 2, 3, 1, 9].map(count).concat());
+    let (b, _) = mesh("a.off", &off).unwrap();
+    assert_eq!((&b.vertices, &b.faces), (&a.vertices, &a.faces), "binary");
+    for (cut, cause) in [(off.len() - 1, "ends too early"), (30, "ends too early")] {
+        assert!(mesh("a.off", &off[..cut]).unwrap_err().to_string().contains(cause), "{cut}");
+    }
+    let last = off.len() - 12;
+    off[last..last + 4].copy_from_slice(&count(4));
+    assert!(mesh("a.off", &off).is_err());
 }
 
 #[test]

@@ -6,7 +6,7 @@
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::file_scan::{FileInfo, FileScan, Settings};
 use super::super::label_column::LabelSource;
-use super::super::point_table::{ColorRange, PointTable, Roles};
+use super::super::point_table::{ColorRange, PointTable, Roles, mixed_scans};
 use super::super::source_bytes::SourceBytes;
 use super::encoding::Text;
 use super::lines::{Line, parse_rows, shorten};
@@ -66,6 +66,15 @@ impl Fields {
         }
     }
 
+    /// What a file has that holds scans of both.
+    fn together_with(self, other: Self) -> Self {
+        Self {
+            intensity: self.intensity || other.intensity,
+            color: self.color || other.color,
+            others: self.others.max(other.others),
+        }
+    }
+
     fn columns(self) -> usize {
         3 + usize::from(self.intensity) + 3 * usize::from(self.color)
     }
@@ -85,7 +94,7 @@ pub(in super::super) fn read(
     let mut station_ids: Vec<u16> = Vec::new();
     let mut all: Option<(PointTable, Fields)> = None;
     let (mut at, mut line_number, mut silent) = (text.start, 1u64, 0u64);
-    let mut grids = Vec::new();
+    let (mut grids, mut of_scans) = (Vec::new(), Vec::new());
     while let Some(head) = read_head(source, at, line_number)? {
         at += head.bytes;
         line_number += head.lines;
@@ -124,23 +133,22 @@ pub(in super::super) fn read(
         grids.push([head.columns, head.rows]);
         match &mut all {
             None => all = Some((table, head.fields)),
-            Some((whole, first)) if first.roles() == roles => whole.append(table),
-            Some(_) => {
-                return Err(Error::unsupported(
-                    path,
-                    format!("scan {} has other columns than those before it", stations.len()),
-                    "split it into one file for each scan",
-                ));
+            Some((whole, before)) => {
+                whole.append(table);
+                *before = before.together_with(head.fields);
             }
         }
+        of_scans.push(head.fields);
         (at, line_number) = (end, next);
     }
     let (table, fields) =
         all.ok_or_else(|| Error::bad(path, "it has no complete PTX header of ten lines", COPY_AGAIN))?;
     if fields.others > 0 {
-        let text = format!("{} numbers at the end of each line have no name and are not used", fields.others);
+        let text = format!("{} numbers at the end of lines have no name and are not used", fields.others);
         warnings.push(Warning::new("unknown-columns", text));
     }
+    warnings.extend(mixed_scans("intensities", "0", of_scans.iter().map(|f| f.intensity)));
+    warnings.extend(mixed_scans("colours", "mid grey", of_scans.iter().map(|f| f.color)));
     let mut info = FileInfo::new("PTX");
     info.header("encoding", text.encoding);
     info.header("grids", &grids);
