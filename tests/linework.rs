@@ -3,6 +3,8 @@
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
 
+mod common;
+
 use adit::io::vector::{self, Shapes, Space};
 use adit::linework::{Feature, Kind, Value};
 use adit::numeric::Vec3;
@@ -179,30 +181,24 @@ fn the_certificate_finds_a_shifted_raster_and_changed_bytes() {
     assert!(text.contains("map/color.png has changed since the run"), "{text}");
 }
 
-/// Other programs read what is written: fiona or geopandas, and ezdxf, when Python has them.
-#[test]
-fn files_open_in_other_programs() {
-    let python = std::env::var("ADIT_PYTHON").unwrap_or_else(|_| "python3".into());
-    let has = |module: &str| {
-        std::process::Command::new(&python)
-            .args(["-c", &format!("import {module}")])
-            .output()
-            .is_ok_and(|o| o.status.success())
-    };
-    let missing: Vec<&str> = ["pyogrio", "ezdxf"].into_iter().filter(|m| !has(m)).collect();
-    if !missing.is_empty() {
-        eprintln!("NOT CHECKED: {python} has no {}; set ADIT_PYTHON to a Python that has them", missing.join(", "));
-        return;
-    }
-    let place = tempfile::tempdir().unwrap();
-    let file = |name: &str| place.path().join(name);
+/// Two lines at seven-digit coordinates, as map and as scan.
+fn write_both_spaces(file: &Path) {
     let far = |x: f64, z: f64| Vec3::new(244_398.0 + x, 6_010_935.0 + x, z);
     let features =
         [line(3, vec![far(0.0, 1.0), far(2.0, 1.5)]), line(8, vec![far(1.0, 1.0), far(3.0, 2.5), far(4.0, 2.0)])];
     let shapes =
         [Shapes { space: Space::Scan, features: &features }, Shapes { space: Space::Map, features: &features }];
+    vector::write(file, &shapes).unwrap();
+}
+
+/// Other programs read what is written: fiona or geopandas, and ezdxf, when Python has them.
+#[test]
+fn files_open_in_other_programs() {
+    let Some(python) = common::python_with("pyogrio, ezdxf") else { return };
+    let place = tempfile::tempdir().unwrap();
+    let file = |name: &str| place.path().join(name);
     for name in ["a.gpkg", "a.dxf", "a.shp", "a.geojson"] {
-        vector::write(&file(name), &shapes).unwrap();
+        write_both_spaces(&file(name));
     }
     let script = r#"
 import sys, ezdxf, pyogrio
@@ -226,4 +222,69 @@ print("fine")
 "#;
     let output = std::process::Command::new(&python).args(["-c", script, path(place.path())]).output().unwrap();
     assert!(output.status.success(), "{}", told(&output));
+}
+
+/// The checks of GDAL's own validator, when Python has it.
+#[test]
+fn gdal_finds_geopackages_valid() {
+    let Some(python) = common::python_with("osgeo_utils.samples.validate_gpkg") else { return };
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("a.gpkg");
+    write_both_spaces(&file);
+    let script = "import sys, osgeo_utils.samples.validate_gpkg as v\n\
+                  found = v.check(sys.argv[1], abort_at_first_error=False, extra_checks=True)\n\
+                  assert not found, found";
+    let output = std::process::Command::new(&python).args(["-c", script, path(&file)]).output().unwrap();
+    assert!(output.status.success(), "{}", told(&output));
+}
+
+/// Requirements of OGC 12-128r17 that SQL can tell: marks of the file, tables that refer to each other, extents, and the
+/// head of each geometry.
+#[test]
+fn geopackages_meet_the_standard() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("a.gpkg");
+    write_both_spaces(&file);
+    let database = rusqlite::Connection::open(&file).unwrap();
+    let one = |sql: &str| database.query_row(sql, [], |row| row.get::<_, i64>(0)).unwrap();
+    assert_eq!(one("PRAGMA application_id"), i64::from(u32::from_be_bytes(*b"GPKG")));
+    assert_eq!(one("PRAGMA user_version"), 10_300);
+    let check: String = database.query_row("PRAGMA integrity_check", [], |row| row.get(0)).unwrap();
+    assert_eq!(check, "ok");
+    assert_eq!(one("SELECT count(*) FROM pragma_foreign_key_check"), 0);
+    assert_eq!(one("SELECT count(*) FROM gpkg_spatial_ref_sys WHERE srs_id IN (-1, 0, 4326)"), 3);
+    let described = "SELECT c.table_name, g.column_name, g.geometry_type_name, g.srs_id, g.z, c.min_x, c.min_y, c.max_x, c.max_y
+                     FROM gpkg_contents c JOIN gpkg_geometry_columns g USING (table_name, srs_id)
+                     WHERE c.data_type = 'features' AND g.m = 0";
+    let mut tables = database.prepare(described).unwrap();
+    let mut rows = tables.query([]).unwrap();
+    let mut seen = Vec::new();
+    while let Some(row) = rows.next().unwrap() {
+        let text = |k: usize| row.get::<_, String>(k).unwrap();
+        let (table, column, kind) = (text(0), text(1), text(2));
+        let (srs, z): (i32, u32) = (row.get(3).unwrap(), row.get(4).unwrap());
+        let extent = [5, 6, 7, 8].map(|k| row.get::<_, f64>(k).unwrap());
+        let mut reached = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
+        let mut shapes = database.prepare(&format!("SELECT {column} FROM {table}")).unwrap();
+        let shapes: Vec<Vec<u8>> = shapes.query_map([], |r| r.get(0)).unwrap().map(Result::unwrap).collect();
+        assert!(!shapes.is_empty(), "{table}");
+        for shape in &shapes {
+            let int = |at: usize| i32::from_le_bytes(shape[at..at + 4].try_into().unwrap());
+            let float = |at: usize| f64::from_le_bytes(shape[at..at + 8].try_into().unwrap());
+            assert_eq!((&shape[..2], shape[2], shape[3] & 1, int(4)), (&b"GP"[..], 0, 1, srs), "{table}");
+            let body = 8 + [0, 32, 48, 48, 64][usize::from(shape[3] >> 1 & 7)];
+            // ISO well-known binary: 2 is a line, 1000 more for three coordinates.
+            assert_eq!((shape[body], int(body + 1)), (1, 2 + 1000 * z as i32), "{table}");
+            assert_eq!(kind, "LINESTRING");
+            let step = if z == 1 { 24 } else { 16 };
+            for at in (0..int(body + 5) as usize).map(|i| body + 9 + i * step) {
+                let (x, y) = (float(at), float(at + 8));
+                reached = [reached[0].min(x), reached[1].min(y), reached[2].max(x), reached[3].max(y)];
+            }
+        }
+        assert_eq!(extent, reached, "{table}");
+        seen.push(table);
+    }
+    seen.sort();
+    assert_eq!(seen, ["traces_map", "traces_scan"]);
 }

@@ -2,9 +2,11 @@
 //! true scale, the package, and pictures that come back from a paint program.
 //!
 //! One run of the bundled scan serves all tests. The checks that need Python packages or a PDF renderer run when these
-//! are there (`ADIT_PYTHON` names another interpreter) and say so when they are not.
+//! are there (`ADIT_TEST_PYTHON` names another interpreter) and say so when they are not.
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
+
+mod common;
 
 use assert_cmd::Command;
 use std::fs::{self, File};
@@ -278,19 +280,8 @@ fn the_way_back_is_drawn_for_the_package() {
     assert_eq!(left.len(), 2, "{left:?}");
 }
 
-/// A Python interpreter that has the modules, or none with a loud word.
-fn python(modules: &str) -> Option<String> {
-    let interpreter = std::env::var("ADIT_PYTHON").unwrap_or_else(|_| "python3".into());
-    let found = Process::new(&interpreter).args(["-c", &format!("import {modules}")]).output();
-    if found.is_ok_and(|o| o.status.success()) {
-        return Some(interpreter);
-    }
-    eprintln!("SKIPPED: {interpreter} has not all of {modules}; ADIT_PYTHON names another interpreter");
-    None
-}
-
 fn check_with_python(modules: &str, check: &str) {
-    let Some(interpreter) = python(modules) else { return };
+    let Some(interpreter) = common::python_with(modules) else { return };
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/map_products.py");
     let output =
         Process::new(interpreter).arg(script).arg(check).arg(run()).arg(env!("CARGO_BIN_EXE_adit")).output().unwrap();

@@ -5,20 +5,12 @@
 
 #![allow(clippy::print_stderr, reason = "a skipped check is told")]
 
+mod common;
+
 use adit::cloud::Cloud;
 use adit::io::{self, PointColumns};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-
-/// The Python with laspy, or why there is none.
-fn python() -> Result<String, String> {
-    let python = std::env::var("ADIT_TEST_PYTHON").unwrap_or_else(|_| "python3".into());
-    match Command::new(&python).args(["-c", "import laspy, lazrs"]).output() {
-        Ok(done) if done.status.success() => Ok(python),
-        Ok(done) => Err(String::from_utf8_lossy(&done.stderr).lines().last().unwrap_or("no laspy").to_owned()),
-        Err(error) => Err(error.to_string()),
-    }
-}
 
 /// What the script ends with when laspy does not read the source.
 const LASPY_GIVES_UP: i32 = 3;
@@ -50,10 +42,7 @@ fn las_files(folder: &Path) -> Vec<PathBuf> {
 
 #[test]
 fn laspy_finds_every_record_header_and_vlr_again() {
-    let python = match python() {
-        Ok(python) => python,
-        Err(cause) => return eprintln!("SKIPPED: no Python with laspy and lazrs ({cause}); set ADIT_TEST_PYTHON"),
-    };
+    let Some(python) = common::python_with("laspy, lazrs") else { return };
     let folder = tempfile::tempdir().unwrap();
     let text: String =
         (0..3000).map(|i| format!("{}.5 {} {} {} {} 7 9\n", i % 91, i % 13, i % 7, i % 999, i % 256)).collect();

@@ -121,7 +121,7 @@ impl Frame<'_> {
         scene.find(&first_states(&window, &shares, is_sampled), search);
         let states = scene.states.clone();
         let mut doubtful = vec![false; states.len()];
-        scene.doubtful().into_iter().for_each(|p| doubtful[p] = true);
+        scene.doubtful(self.rules.mixed, self.rules.noisy).into_iter().for_each(|p| doubtful[p] = true);
 
         let (x0, y0) = (core.column - window.map.column, core.row - window.map.row);
         for (i, (column, row)) in all().enumerate() {

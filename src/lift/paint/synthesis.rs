@@ -20,8 +20,11 @@ const LEAST_SHARE: f32 = 0.3;
 const REGION_PX: usize = 200;
 /// Sweeps over the surroundings of such a region.
 const REGION_SWEEPS: usize = 3;
-/// A class is doubtful when another one would cost less than this more.
-const DOUBT: f32 = 8.0;
+/// A class is doubtful when another one would cost less than this more; in noisy pictures all costs are lower.
+const DOUBT: f32 = 24.0;
+const NOISY_DOUBT: f32 = 8.0;
+/// Pixels of the map, at most, of a region that may be nothing but the mixed colours of two classes that meet there.
+const MIXED_REGION_PX: usize = 8;
 
 /// What a pixel of the map shows: 0 the base, `k + 1` the class `k`.
 pub(super) type State = u16;
@@ -284,29 +287,38 @@ impl<'a> Scene<'a> {
         fits
     }
 
-    /// Gives small regions of a class another one, or takes them back, where that makes a better picture, together with the
-    /// pixels around them.
-    fn reconsider(&mut self) {
+    /// The painted regions: pixels of one class that hang together.
+    fn regions(&self) -> Vec<Vec<usize>> {
         let mut done = vec![false; self.states.len()];
+        let mut regions = Vec::new();
         for start in 0..self.states.len() {
             if done[start] || self.states[start] == 0 {
                 continue;
             }
-            let own = self.states[start];
             let mut region = vec![start];
             done[start] = true;
             let mut next = 0;
             while next < region.len() {
-                let neighbours: Vec<usize> = self.around(region[next]).map(|(n, _)| n).collect();
-                for n in neighbours {
-                    if !done[n] && self.states[n] == own {
+                for (n, _) in self.around(region[next]) {
+                    if !done[n] && self.states[n] == self.states[start] {
                         done[n] = true;
                         region.push(n);
                     }
                 }
                 next += 1;
             }
-            if region.len() > REGION_PX {
+            regions.push(region);
+        }
+        regions
+    }
+
+    /// Gives small regions of a class another one, or takes them back, where that makes a better picture, together with the
+    /// pixels around them.
+    fn reconsider(&mut self) {
+        for region in self.regions() {
+            let own = self.states[region[0]];
+            // A region that was given another class may have taken pixels of this one.
+            if region.len() > REGION_PX || region.iter().any(|&p| self.states[p] != own) {
                 continue;
             }
             let mut others: Vec<State> = region.iter().flat_map(|&p| self.allowed.classes(p)).map(|k| k + 1).collect();
@@ -367,24 +379,28 @@ impl<'a> Scene<'a> {
         gains
     }
 
-    /// Painted pixels that could as well be painted with another class.
-    pub(super) fn doubtful(&mut self) -> Vec<usize> {
+    /// Painted pixels that could as well be painted with another class; in a picture of `mixed` colours also the small regions
+    /// beside another class, which mixed colours may have made up.
+    pub(super) fn doubtful(&mut self, mixed: bool, noisy: bool) -> Vec<usize> {
+        let most = if noisy { NOISY_DOUBT } else { DOUBT };
         let mut doubtful = Vec::new();
-        for p in 0..self.base.len() {
-            let own = self.states[p];
-            if own == 0 {
+        for region in self.regions() {
+            let own = self.states[region[0]];
+            let is_other = |s: State| s != 0 && s != own;
+            let is_small = mixed && region.len() <= MIXED_REGION_PX;
+            if is_small && region.iter().any(|&p| self.around(p).any(|(q, _)| is_other(self.states[q]))) {
+                doubtful.extend(region);
                 continue;
             }
-            let others: Vec<State> = self.allowed.classes(p).map(|k| k + 1).filter(|&s| s != own).collect();
-            let near: Vec<usize> = self.around(p).map(|(q, _)| q).collect();
-            let doubt = others.iter().any(|&s| self.cost(p, s) < DOUBT)
-                || !others.is_empty()
-                    && near.into_iter().any(|q| {
-                        let s = self.states[q];
-                        s != 0 && s != own && self.exchange_cost(p, q) < DOUBT
-                    });
-            if doubt {
-                doubtful.push(p);
+            for p in region {
+                let others: Vec<State> = self.allowed.classes(p).map(|k| k + 1).filter(|&s| s != own).collect();
+                let near: Vec<usize> = self.around(p).map(|(q, _)| q).collect();
+                let doubt = others.iter().any(|&s| self.cost(p, s) < most)
+                    || !others.is_empty()
+                        && near.into_iter().any(|q| is_other(self.states[q]) && self.exchange_cost(p, q) < most);
+                if doubt {
+                    doubtful.push(p);
+                }
             }
         }
         doubtful
