@@ -3,11 +3,13 @@
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::source_bytes::SourceBytes;
 use super::header::{Container, STANDARD_LENGTHS, u32_at, u64_at};
+use super::point14::Point14;
 use crate::cloud::DroppedRecords;
 use crate::warning::Warning;
+use laz::las::{v3, v4};
 use laz::laszip::ChunkTable;
 use laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
-use laz::{DecompressionSelection, LazItemRecordBuilder, LazItemType, LazVlr};
+use laz::{DecompressionSelection, LasZipError, LazItem, LazItemRecordBuilder, LazItemType, LazVlr};
 use std::io::Cursor;
 
 /// Places of the fields in a record of one point format.
@@ -142,11 +144,14 @@ impl<'a> Records<'a> {
         let mut decoder: Box<dyn RecordDecompressor<Cursor<&[u8]>>> = match &self.coding {
             Coding::Layered(_) => {
                 check_layers(vlr, &compressed).map_err(|cause| damaged(chunk.first, &cause))?;
-                Box::new(LayeredPointRecordDecompressor::new(Cursor::new(&compressed[..])))
+                Box::new(layered_decoder(&compressed, vlr.items()).map_err(|e| damaged(chunk.first, &e))?)
             }
-            _ => Box::new(SequentialPointRecordDecompressor::new(Cursor::new(&compressed[..]))),
+            _ => {
+                let mut decoder = SequentialPointRecordDecompressor::new(Cursor::new(&compressed[..]));
+                decoder.set_fields_from(vlr.items()).map_err(|e| damaged(chunk.first, &e))?;
+                Box::new(decoder)
+            }
         };
-        decoder.set_fields_from(vlr.items()).map_err(|e| damaged(chunk.first, &e))?;
         decoder.set_selection(selection);
         let mut piece = vec![0; self.record_len * (chunk.count as usize).min(PIECE_RECORDS)];
         let mut done = 0;
@@ -351,6 +356,43 @@ fn check_items(vlr: &LazVlr, format: u8) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// The decoder of a layered chunk: the points are decoded here, what comes with them by `laz`.
+fn layered_decoder<'a>(
+    chunk: &'a [u8],
+    items: &[LazItem],
+) -> Result<LayeredPointRecordDecompressor<'static, Cursor<&'a [u8]>>, LasZipError> {
+    let mut decoder = LayeredPointRecordDecompressor::new(Cursor::new(chunk));
+    for item in items {
+        match (item.item_type(), item.version()) {
+            (LazItemType::Point14, version @ (3 | 4)) => decoder.add_field_decompressor(Point14::new(version)),
+            (LazItemType::RGB14, 3) => decoder.add_field_decompressor(v3::LasRGBDecompressor::default()),
+            (LazItemType::RGB14, 4) => decoder.add_field_decompressor(v4::LasRGBDecompressor::default()),
+            (LazItemType::RGBNIR14, 3) => {
+                decoder.add_field_decompressor(v3::LasRGBDecompressor::default());
+                decoder.add_field_decompressor(v3::LasNIRDecompressor::default());
+            }
+            (LazItemType::RGBNIR14, 4) => {
+                decoder.add_field_decompressor(v4::LasRGBDecompressor::default());
+                decoder.add_field_decompressor(v4::LasNIRDecompressor::default());
+            }
+            (LazItemType::Byte14(n), 3) => {
+                decoder.add_field_decompressor(v3::LasExtraByteDecompressor::new(n.into()));
+            }
+            (LazItemType::Byte14(n), 4) => {
+                decoder.add_field_decompressor(v4::LasExtraByteDecompressor::new(n.into()));
+            }
+            (LazItemType::WavePacket14, 3) => {
+                decoder.add_field_decompressor(v3::LasWavepacketDecompressor::default());
+            }
+            (LazItemType::WavePacket14, 4) => {
+                decoder.add_field_decompressor(v4::LasWavepacketDecompressor::default());
+            }
+            (kind, version) => return Err(LasZipError::UnsupportedLazItemVersion(kind, version)),
+        }
+    }
+    Ok(decoder)
 }
 
 /// Checks that the layers announced at the head of a layered chunk fit into it, before anything is allocated for them.
