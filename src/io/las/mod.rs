@@ -22,6 +22,8 @@ mod read;
 mod records;
 mod rewrite;
 mod stream;
+#[cfg(test)]
+mod tests;
 
 pub(super) use placed_points::placed_points;
 pub(super) use read::{announced_points, read};

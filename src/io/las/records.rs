@@ -2,11 +2,11 @@
 
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::source_bytes::SourceBytes;
+use super::gps_times::GpsTimeField;
 use super::header::{Container, STANDARD_LENGTHS, u32_at, u64_at};
 use super::point14::Point14;
 use crate::cloud::DroppedRecords;
 use crate::warning::Warning;
-use laz::las::{v3, v4};
 use laz::laszip::ChunkTable;
 use laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
 use laz::{DecompressionSelection, LasZipError, LazItem, LazItemRecordBuilder, LazItemType, LazVlr};
@@ -146,11 +146,7 @@ impl<'a> Records<'a> {
                 check_layers(vlr, &compressed).map_err(|cause| damaged(chunk.first, &cause))?;
                 Box::new(layered_decoder(&compressed, vlr.items()).map_err(|e| damaged(chunk.first, &e))?)
             }
-            _ => {
-                let mut decoder = SequentialPointRecordDecompressor::new(Cursor::new(&compressed[..]));
-                decoder.set_fields_from(vlr.items()).map_err(|e| damaged(chunk.first, &e))?;
-                Box::new(decoder)
-            }
+            _ => Box::new(sequential_decoder(&compressed, vlr.items()).map_err(|e| damaged(chunk.first, &e))?),
         };
         decoder.set_selection(selection);
         let mut piece = vec![0; self.record_len * (chunk.count as usize).min(PIECE_RECORDS)];
@@ -359,37 +355,31 @@ fn check_items(vlr: &LazVlr, format: u8) -> Result<(), String> {
 }
 
 /// The decoder of a layered chunk: the points are decoded here, what comes with them by `laz`.
-fn layered_decoder<'a>(
+pub(super) fn layered_decoder<'a>(
     chunk: &'a [u8],
     items: &[LazItem],
-) -> Result<LayeredPointRecordDecompressor<'static, Cursor<&'a [u8]>>, LasZipError> {
+) -> Result<LayeredPointRecordDecompressor<'a, Cursor<&'a [u8]>>, LasZipError> {
     let mut decoder = LayeredPointRecordDecompressor::new(Cursor::new(chunk));
     for item in items {
         match (item.item_type(), item.version()) {
             (LazItemType::Point14, version @ (3 | 4)) => decoder.add_field_decompressor(Point14::new(version)),
-            (LazItemType::RGB14, 3) => decoder.add_field_decompressor(v3::LasRGBDecompressor::default()),
-            (LazItemType::RGB14, 4) => decoder.add_field_decompressor(v4::LasRGBDecompressor::default()),
-            (LazItemType::RGBNIR14, 3) => {
-                decoder.add_field_decompressor(v3::LasRGBDecompressor::default());
-                decoder.add_field_decompressor(v3::LasNIRDecompressor::default());
-            }
-            (LazItemType::RGBNIR14, 4) => {
-                decoder.add_field_decompressor(v4::LasRGBDecompressor::default());
-                decoder.add_field_decompressor(v4::LasNIRDecompressor::default());
-            }
-            (LazItemType::Byte14(n), 3) => {
-                decoder.add_field_decompressor(v3::LasExtraByteDecompressor::new(n.into()));
-            }
-            (LazItemType::Byte14(n), 4) => {
-                decoder.add_field_decompressor(v4::LasExtraByteDecompressor::new(n.into()));
-            }
-            (LazItemType::WavePacket14, 3) => {
-                decoder.add_field_decompressor(v3::LasWavepacketDecompressor::default());
-            }
-            (LazItemType::WavePacket14, 4) => {
-                decoder.add_field_decompressor(v4::LasWavepacketDecompressor::default());
-            }
-            (kind, version) => return Err(LasZipError::UnsupportedLazItemVersion(kind, version)),
+            // Goes behind those that are there.
+            _ => decoder.set_fields_from(&vec![*item])?,
+        }
+    }
+    Ok(decoder)
+}
+
+/// The decoder of a chunk without layers: the GPS times are decoded here, everything else by `laz`.
+pub(super) fn sequential_decoder<'a>(
+    chunk: &'a [u8],
+    items: &[LazItem],
+) -> Result<SequentialPointRecordDecompressor<'a, Cursor<&'a [u8]>>, LasZipError> {
+    let mut decoder = SequentialPointRecordDecompressor::new(Cursor::new(chunk));
+    for item in items {
+        match (item.item_type(), item.version()) {
+            (LazItemType::GpsTime, 2) => decoder.add_field_decompressor(GpsTimeField::default()),
+            _ => decoder.set_fields_from(&vec![*item])?,
         }
     }
     Ok(decoder)
