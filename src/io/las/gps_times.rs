@@ -1,10 +1,10 @@
 //! GPS times of LAZ: four sequences, each of which goes on in steps.
 //!
-//! When to use: [`GpsTimes`] for each scanner channel of [`super::point14`]; [`GpsTimeField`] for version 2 of the item `GpsTime` of point
-//! formats 1 and 3 to 5. The decoders of the crate `laz` call themselves for each change of the sequence, without a limit where the bytes
-//! are damaged (`docs/decisions/0010-own-decoder-of-layered-points.md`).
-//! Reference: rapidlasso, *LAZ Specification 1.4 - R1* (2022). Times are taken as whole numbers, by their bits, so that
-//! equal steps of time are nearly equal differences. Lasers whose pulses are mixed give several sequences; a time says which
+//! When to use: [`GpsTimes`] for each scanner channel of [`super::point14`]; [`GpsTimeField`] for version 2 of the item `GpsTime`
+//! of point formats 1 and 3 to 5. The decoders of the crate `laz` call themselves for each change of the sequence, without a limit
+//! where the bytes are damaged (`docs/decisions/0010-own-decoder-of-layered-points.md`).
+//! Reference: rapidlasso, *LAZ Specification 1.4 - R1* (2022). Times are taken as whole numbers, by their bits, so that equal
+//! steps of time are nearly equal differences. Lasers whose pulses are mixed give several sequences; a time says which
 //! sequence it goes on, and how many steps further it lies.
 //! Guarantees: a time takes a bounded amount of work, whatever the bytes are.
 
@@ -38,7 +38,7 @@ struct Sequence {
     time: i64,
     /// The usual difference between two times; 0 when it is not known yet.
     step: i32,
-    /// Differences far from the step since the last one that was close. Many of them replace the step.
+    /// Differences far from the step since the last one close to it. More than three replace the step.
     far: u32,
 }
 
@@ -111,7 +111,7 @@ impl GpsTimes {
             0 => {
                 let step = self.differences.decompress(layer, 0, 0)?;
                 let sequence = self.sequence();
-                *sequence = Sequence { step, far: 0, ..*sequence };
+                sequence.step = step;
                 sequence.advance(step);
                 Ok(Next::Read)
             }

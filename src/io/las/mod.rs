@@ -4,7 +4,7 @@
 //! Reference: ASPRS, *LAS Specification 1.4 - R15* (2019); M. Isenburg, *LASzip: lossless compression of lidar data*,
 //! Photogrammetric Engineering & Remote Sensing 79 (2013), 209-217. The arithmetic decoding is done by the `laz` crate;
 //! everything around it (header, records, chunks, columns) is done here, so that nothing is lost on the way back, and so is the
-//! decoding of the points of formats 6 to 10, so that damage cannot end the process.
+//! decoding of GPS times and of the points of formats 6 to 10, so that damage cannot end the process.
 //! Guarantees: no header count is trusted before the file is known to hold it; chunks decode in parallel into disjoint
 //! slots, so columns are the same on any number of threads.
 //! Cost: one pass over the file; working memory of one piece (a few hundred kB) a thread besides the columns, plus the

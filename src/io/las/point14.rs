@@ -336,8 +336,8 @@ const RETURN_KIND: [u8; 256] = {
     kinds
 };
 
-/// Single returns (0), the first and the last of two (1, 2), the first (3), the inner (4) and the last (5) of more; writers that mix the
-/// two numbers up or leave one out get kinds as well, so the rule takes them in either order.
+/// Single returns (0), the first and the last of two (1, 2), the first (3), the inner (4) and the last (5) of more; writers that
+/// mix the two numbers up or leave one out get kinds as well, so the rule takes them in either order.
 const fn return_kind(number: u8, return_number: u8) -> u8 {
     let (few, many) = if number < return_number { (number, return_number) } else { (return_number, number) };
     match (few, many) {
