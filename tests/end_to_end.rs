@@ -370,8 +370,8 @@ fn bad_input_is_told_in_one_line() {
 
 #[test]
 fn gps_times_that_call_the_decoder_again_and_again_do_not_end_the_program() {
-    // Found by fuzzing: damaged layers that change between the sequences of GPS times some 30,000 times for one point, and
-    // hundreds of thousands of times. A decoder that calls itself for each needs that much stack.
+    // Found by fuzzing: a layer that changes between the sequences of GPS times some 30,000 times for one point, and a chunk
+    // without layers that does so more often still. A decoder that calls itself for each needs that much stack.
     for file in ["gps_time_sequences.laz", "gps_time_sequences_deep.laz"] {
         for options in [&["info"][..], &["info", "--json"], &["info", "--threads", "1"]] {
             let output = adit(&[options, &[&format!("tests/damaged/{file}")]].concat());
