@@ -102,10 +102,6 @@ impl Command {
     }
 }
 
-/// Stack of each worker thread. The decoder of LAZ (crate `laz` 0.13) calls itself once for each change between sequences of GPS
-/// times; a damaged layer can ask for hundreds of thousands in a row. Only what is used takes memory.
-const STACK_BYTES: usize = 128 << 20;
-
 const EXAMPLES: &str = "\
 Examples:
   adit run --input scan.laz --out runs/today         a map with everything chosen automatically
@@ -152,7 +148,7 @@ pub fn main() -> ExitCode {
     }
     // 0: as many as there are processors.
     let threads = line.threads.map_or(0, usize::from);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).stack_size(STACK_BYTES).build_global();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
     if let Err(error) = pool {
         console.error(&format!("cannot start the threads: {error}"));
         return Exit::Resources.into();

@@ -2,38 +2,50 @@
 
 use super::super::error::Error;
 use super::super::placed_points::PlacedPoint;
-use super::extra_bytes::{self, ExtraField};
+use super::super::source_bytes::SourceBytes;
+use super::extra_bytes::ExtraField;
+use super::header::{Container, u32_at};
+use super::read::extra_fields;
+use super::records::Records;
 use crate::numeric::Vec3;
+use laz::DecompressionSelection;
+use rayon::prelude::*;
 use std::path::Path;
-
-/// Records read in one go.
-const RUN: u64 = 1 << 18;
 
 /// See [`crate::io::placed_points`].
 pub(in super::super) fn placed_points(path: &Path, each: &mut dyn FnMut(&[PlacedPoint])) -> Result<(), Error> {
-    let bad = |cause: String| Error::bad(path, cause, "run again with --force points");
-    let mut reader = las::Reader::from_path(path).map_err(|e| bad(e.to_string()))?;
-    let header = reader.header();
-    let extra_len = usize::from(header.point_format().extra_bytes);
-    let described = header.vlrs().iter().find(|v| v.user_id == "LASF_Spec" && v.record_id == 4);
-    let fields = described.map_or(vec![], |v| extra_bytes::parse(&v.data, extra_len).0);
+    let source = SourceBytes::open(path)?;
+    let container = Container::read(&source)?;
+    let records = Records::plan(&source, &container, false, &mut Vec::new())?;
+    let (fields, _) = extra_fields(&container);
     // A scan may bring a column of the same name; the run appends its own behind it.
-    let column = |name: &str| -> Result<ExtraField, Error> {
+    let column = |name: &str| -> Result<&ExtraField, Error> {
         let found = fields.iter().rev().find(|f| f.name() == name);
-        found.cloned().ok_or_else(|| bad(format!("its records have no column '{name}'")))
+        found.ok_or_else(|| {
+            Error::bad(path, format!("its records have no column '{name}'"), "run again with --force points")
+        })
     };
     let columns = [column("chainage")?, column("girth")?, column("offset")?];
-    loop {
-        let records = reader.read_points(RUN).map_err(|e| bad(e.to_string()))?;
-        let mut points = Vec::with_capacity(records.len());
-        for point in records.points() {
-            let p = point.map_err(|e| bad(e.to_string()))?;
-            let [u, v, offset] = [0, 1, 2].map(|k| columns[k].value(&p.extra_bytes).unwrap_or(f64::NAN));
-            points.push(PlacedPoint { position_in_scan: Vec3::new(p.x, p.y, p.z), on_map: Vec3::new(u, v, offset) });
-        }
-        if points.is_empty() {
-            return Ok(());
-        }
-        each(&points);
+    let selection = DecompressionSelection::base().decompress_z().decompress_extra_bytes();
+    let extra_at = container.record_len - container.extra_len();
+    let point = |record: &[u8]| {
+        let position_in_scan =
+            Vec3::from_fn(|k, _| f64::from(u32_at(record, 4 * k) as i32) * container.scale[k] + container.offset[k]);
+        let on_map = Vec3::from_fn(|k, _| columns[k].value(&record[extra_at..]).unwrap_or(f64::NAN));
+        PlacedPoint { position_in_scan, on_map }
+    };
+    for group in records.chunks.chunks(rayon::current_num_threads()) {
+        let decoded: Vec<Vec<PlacedPoint>> = group
+            .par_iter()
+            .map(|chunk| {
+                let mut points = Vec::with_capacity(chunk.count as usize);
+                records.visit(chunk, selection, &mut |_, bytes| {
+                    points.extend(bytes.chunks_exact(container.record_len).map(point));
+                })?;
+                Ok(points)
+            })
+            .collect::<Result<_, Error>>()?;
+        decoded.iter().for_each(|points| each(points));
     }
+    Ok(())
 }

@@ -2,12 +2,14 @@
 
 use super::super::error::{COPY_AGAIN, Error};
 use super::super::source_bytes::SourceBytes;
+use super::gps_times::GpsTimeField;
 use super::header::{Container, STANDARD_LENGTHS, u32_at, u64_at};
+use super::point14::Point14;
 use crate::cloud::DroppedRecords;
 use crate::warning::Warning;
 use laz::laszip::ChunkTable;
 use laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
-use laz::{DecompressionSelection, LazItemRecordBuilder, LazItemType, LazVlr};
+use laz::{DecompressionSelection, LasZipError, LazItem, LazItemRecordBuilder, LazItemType, LazVlr};
 use std::io::Cursor;
 
 /// Places of the fields in a record of one point format.
@@ -142,11 +144,10 @@ impl<'a> Records<'a> {
         let mut decoder: Box<dyn RecordDecompressor<Cursor<&[u8]>>> = match &self.coding {
             Coding::Layered(_) => {
                 check_layers(vlr, &compressed).map_err(|cause| damaged(chunk.first, &cause))?;
-                Box::new(LayeredPointRecordDecompressor::new(Cursor::new(&compressed[..])))
+                Box::new(layered_decoder(&compressed, vlr.items()).map_err(|e| damaged(chunk.first, &e))?)
             }
-            _ => Box::new(SequentialPointRecordDecompressor::new(Cursor::new(&compressed[..]))),
+            _ => Box::new(sequential_decoder(&compressed, vlr.items()).map_err(|e| damaged(chunk.first, &e))?),
         };
-        decoder.set_fields_from(vlr.items()).map_err(|e| damaged(chunk.first, &e))?;
         decoder.set_selection(selection);
         let mut piece = vec![0; self.record_len * (chunk.count as usize).min(PIECE_RECORDS)];
         let mut done = 0;
@@ -351,6 +352,37 @@ fn check_items(vlr: &LazVlr, format: u8) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// The decoder of a layered chunk: the points are decoded here, what comes with them by `laz`.
+pub(super) fn layered_decoder<'a>(
+    chunk: &'a [u8],
+    items: &[LazItem],
+) -> Result<LayeredPointRecordDecompressor<'a, Cursor<&'a [u8]>>, LasZipError> {
+    let mut decoder = LayeredPointRecordDecompressor::new(Cursor::new(chunk));
+    for item in items {
+        match (item.item_type(), item.version()) {
+            (LazItemType::Point14, version @ (3 | 4)) => decoder.add_field_decompressor(Point14::new(version)),
+            // Goes behind those that are there.
+            _ => decoder.set_fields_from(&vec![*item])?,
+        }
+    }
+    Ok(decoder)
+}
+
+/// The decoder of a chunk without layers: the GPS times are decoded here, everything else by `laz`.
+pub(super) fn sequential_decoder<'a>(
+    chunk: &'a [u8],
+    items: &[LazItem],
+) -> Result<SequentialPointRecordDecompressor<'a, Cursor<&'a [u8]>>, LasZipError> {
+    let mut decoder = SequentialPointRecordDecompressor::new(Cursor::new(chunk));
+    for item in items {
+        match (item.item_type(), item.version()) {
+            (LazItemType::GpsTime, 2) => decoder.add_field_decompressor(GpsTimeField::default()),
+            _ => decoder.set_fields_from(&vec![*item])?,
+        }
+    }
+    Ok(decoder)
 }
 
 /// Checks that the layers announced at the head of a layered chunk fit into it, before anything is allocated for them.
