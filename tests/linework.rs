@@ -253,7 +253,8 @@ fn geopackages_meet_the_standard() {
     assert_eq!(check, "ok");
     assert_eq!(one("SELECT count(*) FROM pragma_foreign_key_check"), 0);
     assert_eq!(one("SELECT count(*) FROM gpkg_spatial_ref_sys WHERE srs_id IN (-1, 0, 4326)"), 3);
-    let described = "SELECT c.table_name, g.column_name, g.geometry_type_name, g.srs_id, g.z, c.min_x, c.min_y, c.max_x, c.max_y
+    let described =
+        "SELECT c.table_name, g.column_name, g.geometry_type_name, g.srs_id, g.z, c.min_x, c.min_y, c.max_x, c.max_y
                      FROM gpkg_contents c JOIN gpkg_geometry_columns g USING (table_name, srs_id)
                      WHERE c.data_type = 'features' AND g.m = 0";
     let mut tables = database.prepare(described).unwrap();

@@ -51,6 +51,9 @@ const MISSED_RADII: f64 = 0.6;
 const STRAYED_RADII: f64 = 0.4;
 /// An axis that runs through rock for more than this share of its length is none.
 const MOST_BURIED: f64 = 0.02;
+/// Where the centres of the slices lie this close to the axis, in radii, the sections agree, whatever hides the middle of the
+/// void: vehicles and ducts take the widest way from side to side.
+const AGREEING_RADII: f64 = 0.05;
 /// A tunnel that turns by more than this in all, and with a smaller radius than this many of its section's, bends sharply.
 const SHARP_TURN_DEG: f64 = 40.0;
 const SHARPEST_RADII: f64 = 4.0;
@@ -522,6 +525,9 @@ fn sharp_bend(
     refined: &Refined,
     radius_m: f64,
 ) -> Result<Option<SharpBend>, Error> {
+    if refined.residual_m < AGREEING_RADII * refined.radius_m {
+        return Ok(None);
+    }
     let missed = |p: &Vec3| refined.axis.project(p).radius() > MISSED_RADII * radius_m;
     let samples = (refined.axis.length() / void.grid.cell_m).ceil() as usize;
     let at = |i: usize| refined.axis.start_chainage() + refined.axis.length() * i as f64 / samples as f64;
@@ -762,6 +768,27 @@ mod tests {
         assert_eq!(summary.branches.len(), 3, "{:?}", summary.branches);
         assert!(summary.warnings.iter().any(|w| w.code == "thin-walls"), "{:?}", summary.warnings);
         assert!(summary.branches.iter().all(|b| b.side == Side::Left));
+    }
+
+    #[test]
+    fn what_stands_in_a_drift_does_not_bend_its_axis() {
+        use crate::synthetic::Kind;
+        for (course, length_m) in
+            [(Course::Straight, 10.0), (Course::Bend, 14.0), (Course::Ramp, 18.0), (Course::Bend, 30.0)]
+        {
+            let recipe = Recipe {
+                course,
+                length_m,
+                points: (6000.0 * length_m) as usize,
+                furniture: vec![Kind::Duct, Kind::Cables, Kind::Rails, Kind::Vehicle],
+                ..Recipe::default()
+            };
+            let (length, angle) = length_and_angle(&recipe);
+            assert!(
+                length > 0.8 * length_m && angle < 7.0,
+                "{length_m} m {course:?}: length {length:.2} m, {angle:.1} degrees off"
+            );
+        }
     }
 
     #[test]
