@@ -41,6 +41,9 @@ const LEAST_ASPECT: f64 = 0.5;
 const LEAST_ASPECT_HALF_OPEN: f64 = 2.0;
 /// How far beyond the ends of the void more tunnel is looked for, in radii of the section.
 const REACH_RADII: f64 = 8.0;
+/// More tunnel is looked for again, this often at most, when a better axis found this much more surface.
+const MOST_EXTENSIONS: usize = 3;
+const EXTENDED: f64 = 1.005;
 /// The tunnel ends where less than this share of the usual directions is covered.
 const PORTAL_COVERAGE: f64 = 0.72;
 /// Usual share of directions with surface below which there is no section: one wall of a tunnel has half.
@@ -257,6 +260,15 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let mut surface = surface_of(&sample, &void, &skeleton.main_cells, &rough, radius_m);
     let least_step_m = (1.3 * spacing.across_m).max(3.0 * spacing.along_m);
     let mut refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
+    for _ in 0..MOST_EXTENSIONS {
+        // The rough path winds around what stands in the tunnel; its straight continuation may miss the rest of it.
+        let more = surface_of(&sample, &void, &skeleton.main_cells, &refined.axis, refined.radius_m);
+        if more.len() as f64 <= EXTENDED * surface.len() as f64 {
+            break;
+        }
+        surface = more;
+        refined = refine(&surface, &refined.axis, refined.radius_m, least_step_m, 1.5 * refined.radius_m)?;
+    }
     let mut knot_spacing_m = refined.radius_m;
     if let Some(bend) = sharp_bend(&skeleton, &void, &refined, radius_m)? {
         knot_spacing_m = 0.5 * radius_m;
@@ -785,7 +797,7 @@ mod tests {
             };
             let (length, angle) = length_and_angle(&recipe);
             assert!(
-                length > 0.8 * length_m && angle < 7.0,
+                length > 0.87 * length_m && angle < 7.0,
                 "{length_m} m {course:?}: length {length:.2} m, {angle:.1} degrees off"
             );
         }
