@@ -123,7 +123,7 @@ def paint(run, adit):
             ("half.png", image.resize(half, Image.BICUBIC), {}, 0.97),
             ("lanczos.png", image.convert("RGB").resize(half, Image.LANCZOS), {}, 0.97),
             ("double.png", image.resize(double, Image.BICUBIC), {}, 0.99),
-            ("palette.png", image.convert("RGB").quantize(256), {}, 0.97),
+            ("palette.png", image.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE), {}, 0.97),
             ("jpeg.jpg", image.convert("RGB"), {"quality": 85}, 0.95),
             ("crop.png", image.crop(crop), {}, 0.999),
         ]

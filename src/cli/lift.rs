@@ -175,6 +175,13 @@ fn read_label_map(arguments: &Arguments) -> Result<(LabelMap, String, Vec<Palett
             found.undecided_px
         );
     }
+    for [lost, instead] in &found.lost_classes {
+        let _ = write!(
+            told,
+            "\nthe palette of the picture has no colour for {lost}: what was painted with it looks like {instead} and is taken for it; \
+             save with full colours"
+        );
+    }
     for entry in found.classes.iter().filter(|e| found.new_classes.contains(&e.value)) {
         let [r, g, b] = entry.color;
         let _ = write!(told, "\nnew class {} for the colour #{r:02x}{g:02x}{b:02x}", entry.value);

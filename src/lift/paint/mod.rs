@@ -119,6 +119,9 @@ pub struct Recognised {
     pub ambiguous_px: usize,
     /// Painted pixels of the map that could as well have another class; they are unlabelled now.
     pub undecided_px: usize,
+    /// Classes whose colour the palette of the picture lost, each with the class that shows instead: what was painted with the
+    /// first looks like the second.
+    pub lost_classes: Vec<[String; 2]>,
     /// Pixels of the map that are transparent in the edited picture: erased, so they are unlabelled now.
     pub erased_px: usize,
 }
@@ -154,6 +157,7 @@ pub fn recognise(
     // Full colours: palette first, then new ones.
     let mut classes = palette.to_vec();
     let mut shown = passage.colors_of_classes(&classes);
+    let lost_classes = passage.lost_classes(&classes, &shown);
     let mut parts: Vec<Part> = cores.par_iter().map(|&core| frame.solve(core, &shown)).collect();
     let solve_again = |parts: &mut [Part], shown: &[[u8; 3]], which: &dyn Fn(&Part) -> bool| {
         let again: Vec<usize> = (0..parts.len()).filter(|&i| which(&parts[i])).collect();
@@ -258,6 +262,7 @@ pub fn recognise(
         smoothed_px: total(|p| p.smoothed),
         ambiguous_px,
         undecided_px: total(|p| p.undecided),
+        lost_classes,
         erased_px: total(|p| p.erased),
     })
 }

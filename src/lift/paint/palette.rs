@@ -104,6 +104,11 @@ impl Palette {
         (0..classes.len()).map(shown).collect()
     }
 
+    /// Whether a colour is in the palette; dithering makes others from those that are.
+    pub(super) fn has(&self, color: [u8; 3]) -> bool {
+        self.is_dithered || self.entries.contains(&color)
+    }
+
     fn nearest(&self, color: [u8; 3]) -> [u8; 3] {
         self.entries.iter().copied().min_by_key(|&e| color_distance(e, color)).unwrap_or(color)
     }

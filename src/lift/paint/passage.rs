@@ -77,6 +77,19 @@ impl Passage {
             Some(palette) => palette.of_classes(&classes.iter().map(|c| (c.color, c.value)).collect::<Vec<_>>()),
         }
     }
+
+    /// Names of the classes without a colour of their own in the palette of the picture, and of the class that shows instead
+    /// of each, if one does.
+    pub(super) fn lost_classes(&self, classes: &[PaletteEntry], shown: &[[u8; 3]]) -> Vec<[String; 2]> {
+        let Some(palette) = &self.palette else { return Vec::new() };
+        let lost = |k: &usize| classes[*k].value != 0 && !palette.has(shown[*k]);
+        let instead = |k: usize| {
+            let entry = palette.of_base(classes[k].color);
+            let other = (0..classes.len()).find(|&j| j != k && classes[j].value != 0 && shown[j] == entry)?;
+            Some([classes[k].name.clone(), classes[other].name.clone()])
+        };
+        (0..classes.len()).filter(lost).filter_map(instead).collect()
+    }
 }
 
 fn opaque([r, g, b]: [u8; 3]) -> [f32; 4] {

@@ -389,3 +389,20 @@ fn new_colours_like_those_of_classes_stay_apart_in_every_file() {
         assert!(right >= 6_700 && wrong == 0, "{name}: {right} of 7000 right, {wrong} wrong");
     }
 }
+
+#[test]
+fn a_palette_that_lost_the_colour_of_a_class_is_told() {
+    let (bases, _, placement) = bases();
+    let classes = palette(1..=9);
+    let mut painted = bases[1].picture.clone();
+    let red = classes.iter().find(|c| c.value == 1).unwrap();
+    for p in (20..40).flat_map(|y| (100..160).map(move |x| 4 * (y * W + x))) {
+        painted.rgba[p..p + 3].copy_from_slice(&red.color);
+    }
+    let found = recognise(&edited(with_palette(&painted)), &bases, placement, &classes).unwrap();
+    let orange = classes.iter().find(|c| c.color == [255, 127, 0]).unwrap();
+    assert!(found.lost_classes.contains(&[orange.name.clone(), red.name.clone()]), "{:?}", found.lost_classes);
+    assert!(found.lost_classes.iter().all(|[lost, _]| *lost != red.name));
+    let found = recognise(&edited(painted), &bases, placement, &classes).unwrap();
+    assert_eq!(found.lost_classes, Vec::<[String; 2]>::new());
+}
