@@ -83,6 +83,7 @@ def paint(run, adit):
     import numpy as np
     from PIL import Image, ImageDraw
     classes = {c["value"]: tuple(c["color"]) for c in json.load(open(f"{run}/map/labels.json"))["classes"]}
+    names = {c["name"]: c["value"] for c in json.load(open(f"{run}/map/labels.json"))["classes"]}
     labels = np.array(Image.open(f"{run}/map/labels.png").convert("RGBA"))
     surface = labels[..., 3] > 0
 
@@ -123,7 +124,8 @@ def paint(run, adit):
             ("half.png", image.resize(half, Image.BICUBIC), {}, 0.97),
             ("lanczos.png", image.convert("RGB").resize(half, Image.LANCZOS), {}, 0.97),
             ("double.png", image.resize(double, Image.BICUBIC), {}, 0.99),
-            ("palette.png", image.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE), {}, 0.97),
+            ("palette.png", image.convert("RGB").quantize(256), {}, 0.97),
+            ("octree.png", image.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE), {}, 0.97),
             ("jpeg.jpg", image.convert("RGB"), {"quality": 85}, 0.95),
             ("crop.png", image.crop(crop), {}, 0.999),
         ]
@@ -144,8 +146,13 @@ def paint(run, adit):
                 assert done.returncode == 0, (base, name, done.stderr)
                 found = to_labels(np.array(Image.open(f"{folder}/r.png").convert("RGBA")))
                 assert found.shape == before[part].shape, (base, name, found.shape)
-                changed = found != before[part]
-                expected = (truth[part] >= 0) & (truth[part] != before[part])
+                # Only a palette may lose a colour, and only with a word; what is left is held to the same bounds.
+                lost = {names[n] for n in re.findall("has no colour for (.+): what", done.stdout)} & set(some)
+                assert not lost or name == "palette.png", (base, name, lost)
+                judged = ~np.isin(truth[part], list(lost))
+                assert judged[truth[part] >= 0].mean() > 0.85, (base, name, lost)
+                changed = (found != before[part]) & judged
+                expected = (truth[part] >= 0) & (truth[part] != before[part]) & judged
                 right = changed & expected & (found == truth[part])
                 iou = right.sum() / (changed | expected).sum()
                 wrong = (changed & expected & (found != truth[part]) & (truth[part] >= 0)).sum()

@@ -248,9 +248,7 @@ pub(super) fn refine(
             knots.push(curve[last]);
         }
         let next = extended(&knots, slices.step_m)?;
-        // What stands in a tunnel may end the void long before its section stops.
-        let goes_on = first == 0 || last + 1 == count;
-        let settled = moved < SETTLED * radius_m && !goes_on;
+        let settled = moved < SETTLED * radius_m;
         if settled || rounds == ROUNDS {
             return Ok(Refined { axis: next, radius_m, wavelength_m, residual_m });
         }

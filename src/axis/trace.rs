@@ -257,12 +257,15 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     let rough = rough_axis(&skeleton, &void)?;
     let volume = skeleton.main_cells.len() as f64 * void.grid.cell_m.powi(3);
     let radius_m = (volume / rough.length().max(void.clearance_m) / std::f64::consts::PI).sqrt().max(void.clearance_m);
-    let mut surface = surface_of(&sample, &void, &skeleton.main_cells, &rough, radius_m);
+    let ends_of = |axis: &Axis| (axis.start_chainage(), axis.end_chainage());
+    let mut surface = surface_of(&sample, &void, &skeleton.main_cells, &rough, ends_of(&rough), radius_m);
     let least_step_m = (1.3 * spacing.across_m).max(3.0 * spacing.along_m);
     let mut refined = refine(&surface, &rough, radius_m, least_step_m, 1.5 * radius_m)?;
     for _ in 0..MOST_EXTENSIONS {
         // The rough path winds around what stands in the tunnel; its straight continuation may miss the rest of it.
-        let more = surface_of(&sample, &void, &skeleton.main_cells, &refined.axis, refined.radius_m);
+        let void_end = |s: f64| refined.axis.project(&rough.frame_at(s).origin).chainage;
+        let ends = (void_end(rough.start_chainage()), void_end(rough.end_chainage()));
+        let more = surface_of(&sample, &void, &skeleton.main_cells, &refined.axis, ends, refined.radius_m);
         if more.len() as f64 <= EXTENDED * surface.len() as f64 {
             break;
         }
@@ -283,7 +286,7 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
             ),
         ));
         refined = bend.refined;
-        surface = surface_of(&sample, &void, &void.cells, &refined.axis, radius_m);
+        surface = surface_of(&sample, &void, &void.cells, &refined.axis, ends_of(&refined.axis), radius_m);
     }
     let (range, coverage) = covered_range(&surface, &refined, least_step_m)
         .ok_or_else(|| not_a_tunnel("no section is covered well enough", Some(&void), rough.length()))?;
@@ -448,8 +451,16 @@ fn rough_axis(skeleton: &Skeleton, void: &EnclosedVoid) -> Result<Axis, Error> {
     Axis::through(&knots, 0.0)
 }
 
-/// Points on the surface of these cells of the void, and those that continue it beyond its ends.
-fn surface_of(points: &[Vec3], void: &EnclosedVoid, main_cells: &[usize], rough: &Axis, radius_m: f64) -> Vec<Vec3> {
+/// Points on the surface of these cells of the void, and those that continue it along `axis` beyond the chainages where the
+/// void ends.
+fn surface_of(
+    points: &[Vec3],
+    void: &EnclosedVoid,
+    main_cells: &[usize],
+    axis: &Axis,
+    (start, end): (f64, f64),
+    radius_m: f64,
+) -> Vec<Vec3> {
     let grid = &void.grid;
     let occupied_around = |cells: &[usize]| {
         let mut around: Vec<usize> = cells
@@ -473,8 +484,8 @@ fn surface_of(points: &[Vec3], void: &EnclosedVoid, main_cells: &[usize], rough:
             if grid.cell_at(p).is_some_and(|c| walls.binary_search(&c).is_ok()) {
                 return true;
             }
-            let c = rough.project(p);
-            let beyond = (rough.start_chainage() - c.chainage).max(c.chainage - rough.end_chainage());
+            let c = axis.project(p);
+            let beyond = (start - c.chainage).max(c.chainage - end);
             beyond > -radius_m && beyond < REACH_RADII * radius_m && c.radius() < 1.6 * radius_m
         })
         .collect();
@@ -797,7 +808,7 @@ mod tests {
             };
             let (length, angle) = length_and_angle(&recipe);
             assert!(
-                length > 0.87 * length_m && angle < 7.0,
+                length > 0.95 * length_m && angle < 7.0,
                 "{length_m} m {course:?}: length {length:.2} m, {angle:.1} degrees off"
             );
         }

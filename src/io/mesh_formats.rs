@@ -211,6 +211,11 @@ fn binary_off(source: &SourceBytes, prefix: &str, data: &[u8]) -> Result<MeshBui
             .polygon(&corners, None)
             .map_err(|cause| Error::bad(source.path(), format!("face {face} {cause}"), COPY_AGAIN))?;
     }
+    let rest = 4 * numbers.len() + data.len() % 4;
+    if rest > 0 {
+        let text = format!("{rest} bytes after its {faces} faces are not read");
+        builder.warnings.push(Warning::new("trailing-bytes", text));
+    }
     Ok(builder)
 }
 

@@ -16,6 +16,7 @@ use std::path::Path;
 pub(in super::super) fn placed_points(path: &Path, each: &mut dyn FnMut(&[PlacedPoint])) -> Result<(), Error> {
     let source = SourceBytes::open(path)?;
     let container = Container::read(&source)?;
+    // Whether the file is still that of the run is told by its hash, not by warnings.
     let records = Records::plan(&source, &container, false, &mut Vec::new())?;
     let (fields, _) = extra_fields(&container);
     // A scan may bring a column of the same name; the run appends its own behind it.

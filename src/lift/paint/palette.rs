@@ -104,9 +104,10 @@ impl Palette {
         (0..classes.len()).map(shown).collect()
     }
 
-    /// Whether a colour is in the palette; dithering makes others from those that are.
-    pub(super) fn has(&self, color: [u8; 3]) -> bool {
-        self.is_dithered || self.entries.contains(&color)
+    /// Whether a colour got lost: it is not in the palette, and those of the base were replaced, too. A picture of few colours
+    /// that are all kept has lost none; dithering makes others from those that there are.
+    pub(super) fn lost(&self, color: [u8; 3]) -> bool {
+        self.reach > 0.0 && !self.is_dithered && !self.entries.contains(&color)
     }
 
     fn nearest(&self, color: [u8; 3]) -> [u8; 3] {

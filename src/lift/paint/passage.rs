@@ -82,7 +82,7 @@ impl Passage {
     /// of each, if one does.
     pub(super) fn lost_classes(&self, classes: &[PaletteEntry], shown: &[[u8; 3]]) -> Vec<[String; 2]> {
         let Some(palette) = &self.palette else { return Vec::new() };
-        let lost = |k: &usize| classes[*k].value != 0 && !palette.has(shown[*k]);
+        let lost = |k: &usize| classes[*k].value != 0 && palette.lost(shown[*k]);
         let instead = |k: usize| {
             let entry = palette.of_base(classes[k].color);
             let other = (0..classes.len()).find(|&j| j != k && classes[j].value != 0 && shown[j] == entry)?;
