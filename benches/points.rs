@@ -1,11 +1,10 @@
 //! Seconds of each step that works on points alone: voxel means, outlier removal, normals.
 //!
-//! `cargo bench --bench points -- SCAN.laz [--cell 0.05] [--neighbours 16] [--repeat 3] [--normals OUT.f64]`
+//! `cargo bench --bench points -- SCAN.laz [--cell 0.05] [--neighbours 16] [--repeat 3] [--normals OUT]`
 //!
 //! Every step is one call of the library on all points of the scan, as read. Wall seconds and CPU seconds (user and
-//! system, all threads; Linux only) are those of the fastest of the repeats. `--normals` writes the normals of the
-//! adaptive method, in point order, as raw little-endian f64 triples (`points_against_peers.py` measures their error
-//! with it). Without a scan a synthetic drift of a million points is made.
+//! system, all threads; Linux only) are those of the fastest of the repeats. `--normals` writes both normals, in point order, as raw
+//! little-endian f64 triples to OUT.fixed and OUT.adaptive (`points_against_peers.py` measures their error). Without a scan a synthetic drift of a million points is made.
 #![allow(clippy::print_stdout, reason = "a bench is a program of its own")]
 
 use adit::clean::{StatisticalOutliers, VoxelDownsample, remove_statistical_outliers, voxel_downsample};
@@ -91,10 +90,13 @@ fn main() {
         || remove_statistical_outliers(&BundleTree::new(&points), &outliers),
         |v| format!("kept {}, k {neighbours}", v.kept.iter().filter(|k| **k).count()),
     );
-    time("normals, fixed", repeat, || normals::unoriented(&points, neighbours), |_| format!("k {neighbours}"));
+    let fixed =
+        time("normals, fixed", repeat, || normals::unoriented(&points, neighbours), |_| format!("k {neighbours}"));
     let adaptive = time("normals, adaptive", repeat, || normals::adaptive(&points), |_| String::new());
     if let Some(path) = &arguments.normals {
-        let bytes: Vec<u8> = adaptive.iter().flat_map(|n| [n.x, n.y, n.z]).flat_map(f64::to_le_bytes).collect();
-        std::fs::write(path, bytes).expect("the normals can be written");
+        for (normals, name) in [(&fixed, "fixed"), (&adaptive, "adaptive")] {
+            let bytes: Vec<u8> = normals.iter().flat_map(|n| [n.x, n.y, n.z]).flat_map(f64::to_le_bytes).collect();
+            std::fs::write(path.with_extension(name), bytes).expect("the normals can be written");
+        }
     }
 }

@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""The poisson surface of oriented points beside Open3D's at the same depth, and MeshLib's, measured against the true surface.
+"""The section and the poisson surface of oriented points beside Open3D's (poisson at the same depth) and MeshLib's, measured
+against the true surface.
 
     PEERS_VENV=DIR benches/surface_against_peers.py ORIENTED.npz TRUTH.npz --bench EXECUTABLE [--depth 9] [--meshlib]
 
@@ -7,7 +8,8 @@ ORIENTED.npz holds P and N (points and unit normals into the void), TRUTH.npz th
 PEERS_VENV names a Python environment with numpy and open3d (and meshlib); the script starts itself again in it. The bench
 executable is built by `cargo bench --bench surface --no-run`, which prints its name. Each line tells wall seconds and
 CPU seconds (all threads) of the step alone and, over vertices in use: root mean square distance from the truth, of all and
-of those nearer than 10 cm, the share that is farther away, and the share of the truth's vertices within 2 cm of the mesh.
+of those nearer than 10 cm, the share that is farther away, and the share of the truth's vertices within 2 cm of the mesh;
+then the boundary loops and how far the surface goes at most from the nearest point (middles of faces and vertices).
 """
 import argparse
 import os
@@ -34,6 +36,9 @@ def main():
         os.execv(python, [python, *sys.argv])
     import numpy as np
     import open3d as o3d
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     data, truth = np.load(given.oriented), np.load(given.truth)
     points, normals = np.ascontiguousarray(data["P"]), np.ascontiguousarray(data["N"])
@@ -45,30 +50,44 @@ def main():
         parts = [queries[a : a + 200_000].astype(np.float32) for a in range(0, len(queries), 200_000)]
         return np.concatenate([scene.compute_distance(o3d.core.Tensor(p)).numpy() for p in parts])
 
+    def boundary_loops(faces):
+        edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        edges, count = np.unique(edges, axis=0, return_counts=True)
+        ends, index = np.unique(edges[count == 1], return_inverse=True)
+        index = index.reshape(-1, 2)
+        graph = coo_matrix((np.ones(len(index)), (index[:, 0], index[:, 1])), (len(ends), len(ends)))
+        return connected_components(graph, directed=False)[0]
+
+    tree = cKDTree(points)
+
     def tell(name, vertices, faces):
         used = vertices[np.unique(faces)]
         d = distances(true_vertices, true_faces, used)
         sample = true_vertices[np.random.default_rng(3).choice(len(true_vertices), 200_000, replace=False)]
         covered = (distances(vertices, faces, sample) < 0.02).mean()
+        places = np.vstack([used, vertices[faces].mean(axis=1)])
+        farthest = tree.query(places, workers=-1)[0].max()
         rms = lambda e: 1000 * np.sqrt((e**2).mean())
         print(
             f"{name:<18} {len(faces):8d} faces  rms {rms(d):7.2f} mm, within 10 cm {rms(d[d < 0.1]):5.2f} mm, "
-            f"farther {100 * (d >= 0.1).mean():.2f} %, truth covered {100 * covered:.1f} %",
+            f"farther {100 * (d >= 0.1).mean():.2f} %, truth covered {100 * covered:.1f} %, {boundary_loops(faces)} boundary "
+            f"loops, at most {100 * farthest:.1f} cm from a point",
             flush=True,
         )
 
     # Open3D's cube is 1.1 times the longest side of the box.
     cell = given.cell or 1.1 * (points.max(0) - points.min(0)).max() / 2**given.depth
     with tempfile.TemporaryDirectory() as folder:
-        oriented, mesh = os.path.join(folder, "oriented.f64"), os.path.join(folder, "mesh.bin")
+        oriented, mesh = os.path.join(folder, "oriented.f64"), os.path.join(folder, "mesh")
         np.hstack([points, normals]).astype("<f8").tofile(oriented)
-        print(f"adit, cells of {cell:.4f} m", flush=True)
+        print(f"adit, poisson in cells of {cell:.4f} m", flush=True)
         subprocess.run([given.bench, oriented, str(cell), "--mesh", mesh], check=True)
-        with open(mesh, "rb") as file:
-            nv, nf = np.fromfile(file, "<i8", 2)
-            vertices = np.fromfile(file, "<f8", 3 * nv).reshape(-1, 3)
-            faces = np.fromfile(file, "<i4", 3 * nf).reshape(-1, 3)
-        tell("adit poisson", vertices, faces)
+        for method in ["section", "poisson"]:
+            with open(f"{mesh}.{method}", "rb") as file:
+                nv, nf = np.fromfile(file, "<i8", 2)
+                vertices = np.fromfile(file, "<f8", 3 * nv).reshape(-1, 3)
+                faces = np.fromfile(file, "<i4", 3 * nf).reshape(-1, 3)
+            tell(f"adit {method}", vertices, faces)
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)

@@ -587,33 +587,32 @@ fn fill_depths(grid: &Grid, state: &[Node], places: &mut [GridPoint]) {
         (0, -2, 1.0),
         (0, 2, 1.0),
     ];
+    // The sweeps run one node after the other: where each node's neighbours lie is told beforehand.
+    const NOWHERE: u32 = u32::MAX;
+    let around: Vec<[u32; 12]> =
+        unknown.par_iter().map(|&n| ring.map(|(di, dj, _)| step(n, di, dj).map_or(NOWHERE, |m| m as u32))).collect();
+    let mut depth: Vec<f64> = places.par_iter().map(|p| p.depth).collect();
+    let mean_weights = [a, a, 1.0, 1.0];
     for sweep in 0..FILL_SWEEPS {
-        let order: Box<dyn Iterator<Item = &usize>> =
-            if sweep % 2 == 0 { Box::new(unknown.iter()) } else { Box::new(unknown.iter().rev()) };
-        for &n in order {
-            let mut sum = 0.0;
-            let complete = ring.iter().all(|&(di, dj, w)| {
-                step(n, di, dj).is_some_and(|m| {
-                    sum += w * places[m].depth;
-                    true
-                })
-            });
-            if complete {
-                places[n].depth = -sum / diagonal;
+        for k in 0..unknown.len() {
+            let k = if sweep % 2 == 0 { k } else { unknown.len() - 1 - k };
+            let (n, beside) = (unknown[k], &around[k]);
+            if !beside.contains(&NOWHERE) {
+                let sum: f64 = ring.iter().zip(beside).map(|((_, _, w), &m)| w * depth[m as usize]).sum();
+                depth[n] = -sum / diagonal;
                 continue;
             }
             let (mut sum, mut weight) = (0.0, 0.0);
-            for (di, dj, w) in [(-1, 0, a), (1, 0, a), (0, -1, 1.0), (0, 1, 1.0)] {
-                if let Some(m) = step(n, di, dj) {
-                    sum += w * places[m].depth;
-                    weight += w;
-                }
+            for (w, &m) in mean_weights.iter().zip(beside).filter(|(_, m)| **m != NOWHERE) {
+                sum += w * depth[m as usize];
+                weight += w;
             }
             if weight > 0.0 {
-                places[n].depth = sum / weight;
+                depth[n] = sum / weight;
             }
         }
     }
+    unknown.iter().for_each(|&n| places[n].depth = depth[n]);
 }
 
 /// Vertices of the present nodes and two triangles for each complete square of them, one for three corners.

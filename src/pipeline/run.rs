@@ -40,7 +40,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "clean", version: 2, needs: &["ingest"] },
     Stage { name: "axis", version: 4, needs: &["clean"] },
     Stage { name: "normals", version: 2, needs: &["ingest", "clean", "axis"] },
-    Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "segment", version: 6, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 5, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },

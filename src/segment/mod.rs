@@ -350,6 +350,8 @@ mod tests {
         let cases = [
             (horseshoe, Course::Bend, 1, 0.05, &all[..]),
             (horseshoe, Course::Ramp, 12, 0.1, &all[..]),
+            // The vehicle takes half of the floor.
+            (Shape::Horseshoe { width_m: 5.0, height_m: 4.8 }, Course::Straight, 1, 0.05, &all[..]),
             (Shape::Circle { radius_m: 2.5 }, Course::Straight, 1, 0.05, &all[..2]),
         ];
         for (shape, course, seed, roughness_m, furniture) in cases {
@@ -379,11 +381,28 @@ mod tests {
             assert!(wall.0 >= 0.99 && wall.1 >= 0.98, "{shape:?} {course:?} {seed}: wall {wall:?} {summary:?}");
             let furniture = score(&scan.truth.surface, &class, Surface::Furniture, Class::Furniture);
             assert!(furniture.0 >= 0.97 && furniture.1 >= 0.94, "{shape:?} {course:?} {seed}: furniture {furniture:?}");
-            if shape == horseshoe {
+            if matches!(shape, Shape::Horseshoe { .. }) {
                 let floor = score(&scan.truth.surface, &class, Surface::Floor, Class::Floor);
                 assert!(floor.0 >= 0.97 && floor.1 >= 0.97, "{shape:?} {course:?} {seed}: floor {floor:?} {summary:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_narrow_stretch_of_the_tunnel_is_wall() {
+        // Between 12 and 16 m the tube is half a metre narrower all around.
+        let points: Vec<Vec3> = (0..300_000)
+            .map(|i| {
+                let s = 30.0 * (f64::from(i) * 0.618_033_988_749_895).fract();
+                let a = std::f64::consts::TAU * (f64::from(i) * 0.754_877_666_246_693).fract();
+                let radius = if (12.0..16.0).contains(&s) { 2.0 } else { 2.5 };
+                Vec3::new(s, radius * a.cos(), radius * a.sin())
+            })
+            .collect();
+        let axis = Axis::through(&[Vec3::zeros(), Vec3::new(30.0, 0.0, 0.0)], 0.0).unwrap();
+        let (found, summary) = classify_positions(&points, &axis, &Settings::default()).unwrap();
+        let wall = found.class.iter().filter(|c| **c == Class::Wall).count();
+        assert!(wall as f64 > 0.995 * points.len() as f64, "{summary:?}");
     }
 
     #[test]

@@ -32,6 +32,14 @@ const BEHIND_IN_RADII: f64 = 0.25;
 /// Width of the window that finds things standing out of the wall, and how far they do at least, in mean radii.
 const STAND_OUT_WINDOW_IN_RADII: f64 = 0.7;
 const STAND_OUT_IN_RADII: f64 = 0.13;
+/// How far to both sides the usual depth is looked for along the tunnel, metres: vehicles are shorter than this.
+const COURSE_REACH_M: f64 = 7.5;
+/// Length of tunnel that shares one depth on that way, metres.
+const COURSE_STEP_M: f64 = 0.5;
+/// So many robust standard deviations from the usual depth are no relief.
+const UNUSUAL: f64 = 4.0;
+/// What takes more than this share of a section is a narrower tunnel and no thing in it.
+const MOST_OF_A_SECTION: f64 = 0.6;
 /// A bench is at least this long and this wide, metres, and not higher than this share of the tunnel's height.
 const BENCH_LENGTH_M: f64 = 5.0;
 const BENCH_WIDTH_M: f64 = 0.25;
@@ -171,10 +179,12 @@ fn first_of_cells(grid: &Grid, clusters: &[Cluster]) -> Vec<u32> {
     first
 }
 
-/// Clusters of the largest patch that stand out in front of it: narrow dents of the depth picture deeper than rock makes
-/// them. A morphological closing fills every dent narrower than its window; what it fills by more than
-/// [`STAND_OUT_IN_RADII`] is a core, and the thing is all that hangs together with a core and is filled by half of that.
-/// The lowest part of the section is left alone: kerbs and ballast are ground.
+/// Clusters of the largest patch that stand out in front of it, by one of two measures. A morphological closing fills every
+/// dent of the depth picture narrower than its window: ducts, people, whatever is small beside the section. And along the
+/// tunnel the depth at the same girth is usually another: a vehicle may take half of the floor, but not half of the tunnel.
+/// What is in front by more than [`STAND_OUT_IN_RADII`] is a core; the thing is all that hangs together with a core and is in
+/// front by half of that. No core lies in the lowest part of the section, and only the second measure counts there: kerbs
+/// and ballast are ground, and go on.
 fn standing_out(
     grid: &Grid,
     section: &SectionField,
@@ -233,32 +243,74 @@ fn standing_out(
         .map(|cell| place(cell, far[cell]))
         .fold((f64::MAX, f64::MIN), |(l, h), up| (l.min(up), h.max(up)));
     let ground = low + BENCH_HEIGHT_SHARE * (high - low);
-    let filled: Vec<f64> = clusters
-        .par_iter()
-        .enumerate()
-        .map(|(k, c)| {
-            let cell = c.cell as usize;
-            if !in_main(k) || !closed[cell].is_finite() || place(cell, c.middle) < ground {
-                return 0.0;
-            }
-            closed[cell] - c.middle
-        })
-        .collect();
     let core = STAND_OUT_IN_RADII * mean_radius;
-    let mut out: Vec<bool> = filled.iter().map(|&f| f > core).collect();
-    let mut stack: Vec<usize> = (0..clusters.len()).filter(|&k| out[k]).collect();
-    while let Some(k) = stack.pop() {
-        let cell = clusters[k].cell as usize;
-        for n in std::iter::once(cell).chain(grid.neighbours(cell, 1)) {
-            for m in range(n) {
-                if !out[m] && filled[m] > core / 2.0 && step(&clusters[k], &clusters[m]).abs() <= MAX_STEP_M {
-                    out[m] = true;
-                    stack.push(m);
+    let usual = usual_along(grid, &far);
+    let mut relief: Vec<f64> = far.iter().zip(&usual).map(|(d, u)| (d - u).abs()).filter(|d| d.is_finite()).collect();
+    // In a cave nothing is usual.
+    let unusual = core.max(UNUSUAL * 1.4826 * statistics::median(&mut relief).unwrap_or(f64::INFINITY));
+    // In front by how many cores.
+    let above_ground: Vec<bool> = clusters.par_iter().map(|c| place(c.cell as usize, c.middle) >= ground).collect();
+    let measure = |of: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
+        let value = |k: usize| if in_main(k) { of(k) } else { f64::NAN };
+        (0..clusters.len()).into_par_iter().map(value).collect()
+    };
+    let by_window = measure(&|k| {
+        let fill = closed[clusters[k].cell as usize] - clusters[k].middle;
+        if above_ground[k] && fill.is_finite() { fill / core } else { 0.0 }
+    });
+    let by_course = measure(&|k| (usual[clusters[k].cell as usize] - clusters[k].middle) / unusual);
+    let mut out = vec![false; clusters.len()];
+    for (in_front, largest_share) in [(by_window, f64::INFINITY), (by_course, MOST_OF_A_SECTION)] {
+        let mut seen = vec![false; clusters.len()];
+        for seed in 0..clusters.len() {
+            let is_core = in_front[seed] > 1.0 && above_ground[seed];
+            if !is_core || std::mem::replace(&mut seen[seed], true) {
+                continue;
+            }
+            let mut thing = vec![seed];
+            let mut done = 0;
+            while done < thing.len() {
+                let k = thing[done];
+                done += 1;
+                let cell = clusters[k].cell as usize;
+                for m in std::iter::once(cell).chain(grid.neighbours(cell, 1)).flat_map(range) {
+                    let hangs_on = step(&clusters[k], &clusters[m]).abs() <= MAX_STEP_M;
+                    if in_front[m] > 0.5 && hangs_on && !std::mem::replace(&mut seen[m], true) {
+                        thing.push(m);
+                    }
                 }
+            }
+            let mut rows_of_it: Vec<usize> = thing.iter().map(|&k| clusters[k].cell as usize / grid.columns).collect();
+            rows_of_it.sort_unstable();
+            rows_of_it.dedup();
+            if thing.len() as f64 <= largest_share * (rows_of_it.len() * grid.columns) as f64 {
+                thing.into_iter().for_each(|k| out[k] = true);
             }
         }
     }
     out
+}
+
+/// The usual depth of each cell: the median along the tunnel of what lies at the same girth, NaN where nothing is known.
+fn usual_along(grid: &Grid, far: &[f64]) -> Vec<f64> {
+    let rows_a_step = ((COURSE_STEP_M / grid.row_m).round() as usize).max(1);
+    let steps = grid.rows.div_ceil(rows_a_step);
+    let reach = (COURSE_REACH_M / (rows_a_step as f64 * grid.row_m)).ceil() as usize;
+    let median_of = |values: &mut dyn Iterator<Item = f64>| {
+        let mut known: Vec<f64> = values.filter(|d| d.is_finite()).collect();
+        statistics::median(&mut known).unwrap_or(f64::NAN)
+    };
+    let columns: Vec<Vec<f64>> = (0..grid.columns)
+        .into_par_iter()
+        .map(|j| {
+            let rows_of = |k: usize| k * rows_a_step..((k + 1) * rows_a_step).min(grid.rows);
+            let stepped: Vec<f64> =
+                (0..steps).map(|k| median_of(&mut rows_of(k).map(|i| far[i * grid.columns + j]))).collect();
+            let near = |k: usize| k.saturating_sub(reach)..(k + reach + 1).min(steps);
+            (0..steps).map(|k| median_of(&mut stepped[near(k)].iter().copied())).collect()
+        })
+        .collect();
+    (0..grid.len()).map(|cell| columns[cell % grid.columns][cell / grid.columns / rows_a_step]).collect()
 }
 
 /// Step between two clusters: 0 when their depth ranges overlap; negative when `a` lies in front of `b`.
