@@ -7,7 +7,7 @@
 //!
 //! Cost: linear in points and cells.
 
-use crate::axis::{Axis, Side};
+use crate::axis::{Axis, AxisCoordinates, Side};
 use crate::numeric::Vec3;
 use crate::segment::unrolled_grid::Grid;
 use crate::segment::{Class, SectionField, Segmentation};
@@ -41,6 +41,8 @@ pub enum SideOpenings {
 pub struct SideOpening {
     /// Chainage of its middle, metres.
     pub chainage_m: f64,
+    /// Angle of its middle around the axis, degrees: 0 at the crown, 90 on the right wall.
+    pub angle_deg: f64,
     /// The side on which it leaves, facing increasing chainage.
     pub side: Side,
     /// Extent along the tunnel and around the section, metres.
@@ -176,12 +178,6 @@ fn describe(
     let column = ((low + high + 1) as f64 / 2.0 + reference as f64 - half as f64).rem_euclid(grid.columns as f64);
     let (left, right) = section.girth_range(chainage_m);
     let angle = section.angle_of_girth(chainage_m, left + (right - left) * column / grid.columns as f64);
-    let side = match angle.to_degrees() {
-        a if a.abs() <= 45.0 => Side::Above,
-        a if a.abs() >= 135.0 => Side::Below,
-        a if a > 0.0 => Side::Right,
-        _ => Side::Left,
-    };
     let mut behind: Vec<(u32, f64)> = region.iter().flat_map(|&c| points_in[c].iter().copied()).collect();
     behind.sort_unstable_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
     let far =
@@ -192,7 +188,8 @@ fn describe(
     let seen_depth_m = far.last().map_or(0.0, |f| f.1);
     SideOpening {
         chainage_m,
-        side,
+        angle_deg: angle.to_degrees(),
+        side: Side::of(&AxisCoordinates::from_polar(chainage_m, angle, 1.0)),
         width_m: [(last - first + 1) as f64 * grid.row_m, (high - low + 1) as f64 * grid.column_m],
         seen_depth_m,
         points: behind.len(),

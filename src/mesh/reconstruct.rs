@@ -1,16 +1,16 @@
 //! The verb of the mesh stage: from classified points, or from faces made elsewhere, to one oriented manifold.
 
+use super::borders::{self, Borders};
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
 use super::{Mesh, VertexId, poisson, repair, section, topology};
 use crate::axis::{Axis, AxisCoordinates};
-use crate::numeric::{Vec3, wrap_angle};
+use crate::numeric::Vec3;
 use crate::segment::{Class, Segmentation};
 use crate::warning::Warning;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::f64::consts::TAU;
 
 /// Above this share of cells with several depths the section method loses too much of the surface, percent.
 const MANY_DEPTHS_PERCENT: f64 = 5.0;
@@ -92,8 +92,10 @@ pub struct Summary {
     pub area_m2: f64,
     /// Share of the area that no point supports (filled holes), percent.
     pub filled_percent: f64,
-    /// Boundary loops: two portals and the holes that stayed.
+    /// All boundary loops: those that `borders` tells apart.
     pub boundary_loops: usize,
+    /// The borders by what they are.
+    pub borders: Borders,
     /// Side drifts, niches and rooms that open into the wall.
     pub openings: Vec<SideOpening>,
     /// Numbers of the section method.
@@ -197,9 +199,8 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
         warnings.push(openings::warning(&section.openings));
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("section", reason, &mesh, warnings);
+    let mut summary = describe("section", reason, &mesh, axis, section.openings.clone(), warnings);
     summary.decimate = thinned;
-    summary.openings = section.openings.clone();
     summary.section = Some(section);
     Ok((mesh, summary))
 }
@@ -219,7 +220,7 @@ fn cannot_be_opened(mesh: &Mesh, summary: &Summary, axis: &Axis, segmentation: &
     let borders = topology::boundary_loops(mesh.faces(), mesh.twins());
     let around: Vec<i64> = borders
         .iter()
-        .map(|border| turns(axis, &border.iter().map(|&v| mesh.vertices()[v as usize]).collect::<Vec<_>>()))
+        .map(|border| borders::turns(axis, &border.iter().map(|&v| mesh.vertices()[v as usize]).collect::<Vec<_>>()))
         .filter(|t| *t != 0)
         .collect();
     (around.len() > 2 || around.iter().any(|t| t.abs() > 1))
@@ -311,9 +312,8 @@ fn by_poisson(
         return Err(Error::NoSurface { points: surface });
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("poisson", reason, &mesh, warnings);
+    let mut summary = describe("poisson", reason, &mesh, axis, openings, warnings);
     summary.decimate = thinned;
-    summary.openings = openings;
     summary.poisson = Some(poisson);
     summary.repair = Some(repaired);
     Ok((mesh, summary))
@@ -329,7 +329,7 @@ fn finish(
     surface.keep_largest();
     surface.cut_handles();
     if settings.fill_hole_m > 0.0 {
-        surface.fill_holes(settings.fill_hole_m, |border| turns(axis, border) == 0);
+        surface.fill_holes(settings.fill_hole_m, |border| borders::turns(axis, border) == 0);
     }
     // A cut may have parted what only hung together over the rim of a hole.
     surface.keep_largest();
@@ -356,13 +356,6 @@ fn thin(mesh: Mesh, settings: &Settings) -> (Mesh, Option<decimate::Summary>) {
         }
         None => (mesh, None),
     }
-}
-
-/// Whole turns of a border around the axis.
-fn turns(axis: &Axis, border: &[Vec3]) -> i64 {
-    let angles: Vec<f64> = border.iter().map(|p| axis.project(p).angle()).collect();
-    let sum: f64 = (0..angles.len()).map(|i| wrap_angle(angles[(i + 1) % angles.len()] - angles[i])).sum();
-    (sum / TAU).round() as i64
 }
 
 /// Whether a mesh from elsewhere falls into pieces that have to be made into one surface: then [`sample_faces`] and
@@ -431,19 +424,27 @@ pub fn take_over(
         ));
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("given", "the input is a mesh".to_owned(), &mesh, warnings);
+    let mut summary = describe("given", "the input is a mesh".to_owned(), &mesh, axis, Vec::new(), warnings);
     summary.decimate = thinned;
     summary.repair = Some(repaired);
     Ok((mesh, summary))
 }
 
-fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<Warning>) -> Summary {
+fn describe(
+    method: &'static str,
+    reason: String,
+    mesh: &Mesh,
+    axis: &Axis,
+    openings: Vec<SideOpening>,
+    mut warnings: Vec<Warning>,
+) -> Summary {
     let area_m2 = mesh.area();
     let filled: f64 = (0..mesh.faces().len())
         .filter(|&f| !mesh.observed()[f])
         .map(|f| mesh.double_area_vector(f as u32).norm() / 2.0)
         .sum();
-    let twin = mesh.twins();
+    let borders = Borders::of(mesh, axis, &openings);
+    warnings.extend(borders.warning(axis));
     Summary {
         method,
         reason,
@@ -451,8 +452,9 @@ fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<War
         faces: mesh.faces().len(),
         area_m2,
         filled_percent: 100.0 * filled / area_m2,
-        boundary_loops: topology::boundary_loops(mesh.faces(), twin).len(),
-        openings: Vec::new(),
+        boundary_loops: borders.portals + borders.open_edges + borders.side_openings + borders.holes,
+        borders,
+        openings,
         section: None,
         poisson: None,
         decimate: None,
@@ -495,6 +497,7 @@ fn check(settings: &Settings) -> Result<(), Error> {
 mod tests {
     use super::*;
     use crate::segment::{self, classify_positions};
+    use std::f64::consts::TAU;
 
     fn axis() -> Axis {
         Axis::through(&[Vec3::zeros(), Vec3::new(20.0, 0.0, 0.0)], 0.0).unwrap()

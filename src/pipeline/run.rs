@@ -41,7 +41,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "axis", version: 4, needs: &["clean"] },
     Stage { name: "normals", version: 2, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 5, needs: &["ingest", "clean", "axis"] },
-    Stage { name: "mesh", version: 5, needs: &["segment", "normals", "axis"] },
+    Stage { name: "mesh", version: 6, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
     Stage { name: "anchor", version: 3, needs: &["unwrap", "ingest"] },
@@ -54,7 +54,7 @@ pub const STAGES: &[Stage] = &[
 pub const MESH_STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "axis", version: 4, needs: &["ingest"] },
-    Stage { name: "mesh", version: 6, needs: &["ingest", "axis"] },
+    Stage { name: "mesh", version: 7, needs: &["ingest", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
     Stage { name: "map", version: 3, needs: &["unwrap", "mesh", "ingest"] },
