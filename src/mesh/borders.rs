@@ -25,6 +25,7 @@ const RIM_SHARE: f64 = 0.5;
 /// What a border is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
+#[schemars(rename = "BorderKind")]
 pub enum Kind {
     /// It winds around the axis: an end of the tunnel, or of what was scanned of it.
     Portal,
