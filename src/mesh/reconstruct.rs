@@ -3,7 +3,7 @@
 use super::borders::{self, Borders};
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
-use super::{Mesh, VertexId, poisson, repair, section, topology};
+use super::{FaceId, Mesh, VertexId, poisson, repair, section, topology};
 use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::Vec3;
 use crate::segment::{Class, Segmentation};
@@ -55,8 +55,8 @@ pub struct Settings {
     /// The wall behind ducts, cables and other furniture is filled and marked where its shadow is narrower than this,
     /// metres; 0 leaves holes. Only the section method knows where the wall goes on.
     pub fill_behind_furniture_m: f64,
-    /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim,
-    /// `"keep"` keeps what was seen of it.
+    /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim, `"close"`
+    /// continues the wall over it, however wide, and marks that as filled, `"keep"` keeps what was seen of it.
     pub side_openings: SideOpenings,
     /// Thins the mesh: `{ faces = N }` down to a number of faces, `{ deviation_m = X }` as far as the surface moves no
     /// more than that. Not thinned when not given.
@@ -98,6 +98,9 @@ pub struct Summary {
     pub borders: Borders,
     /// Side drifts, niches and rooms that open into the wall.
     pub openings: Vec<SideOpening>,
+    /// Surface that nobody saw, over side openings that were closed, square metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub openings_closed_m2: Option<f64>,
     /// Numbers of the section method.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub section: Option<section::Summary>,
@@ -158,7 +161,8 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
     }
     let count = |class: Class| segmentation.class.iter().filter(|k| **k == class).count();
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
-    let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
+    let (mesh, section, line) =
+        section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
     let share = section.multiple_depth_percent;
     let mut reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
     let front = count(Class::Furniture);
@@ -195,11 +199,13 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
             ),
         ));
     }
-    if !section.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
-        warnings.push(openings::warning(&section.openings));
+    let closed_m2 = closed_m2(&mesh, &line, axis, segmentation, settings);
+    if !line.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
+        warnings.push(openings::warning(&line.openings, closed_m2));
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("section", reason, &mesh, axis, section.openings.clone(), warnings);
+    let mut summary = describe("section", reason, &mesh, axis, line.openings, warnings);
+    summary.openings_closed_m2 = closed_m2;
     summary.decimate = thinned;
     summary.section = Some(section);
     Ok((mesh, summary))
@@ -259,13 +265,21 @@ fn by_poisson(
     let compressed = poisson::Compressed::for_profiles(&segmentation.sampling, axis, &poisson_options);
     let place = |c: &AxisCoordinates| compressed.as_ref().map_or_else(|| axis.point_at(c), |k| k.place(c));
     let classified = || segmentation.coordinates.par_iter().zip(&segmentation.class);
-    let points: Vec<Vec3> = classified()
+    let line = (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let is_open = |c: &AxisCoordinates| line.as_ref().is_some_and(|l| l.is_open(c, &segmentation.section));
+    let closes = settings.side_openings == SideOpenings::Close;
+    let mut points: Vec<Vec3> = classified()
         .filter(|(_, k)| k.is_surface() || (rock_in_front && **k == Class::Furniture))
+        .filter(|(c, _)| !(closes && is_open(c)))
         .map(|(c, _)| place(c))
         .collect();
-    let walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
-    let wall_line =
-        (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let mut walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
+    if let Some(line) = line.as_ref().filter(|_| closes) {
+        // The wall line stands in for what was seen behind it, so that the surface runs on over the mouth.
+        let drawn: Vec<Vec3> = line.continued(&segmentation.section).iter().map(place).collect();
+        walls.extend(&drawn);
+        points.extend(drawn);
+    }
     let (mut raw, mut poisson) = match &compressed {
         Some(k) => {
             let options = poisson::Options { spacing_m: Some(k.cell_m), ..poisson_options };
@@ -288,13 +302,11 @@ fn by_poisson(
     }
     warnings.extend(poisson.warning(settings.spacing_m));
     let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
-    let mut openings = Vec::new();
-    if let Some(line) = wall_line {
-        surface_under_repair.retain(|[a, b, c]| !line.is_open(&axis.project(&((a + b + c) / 3.0)), segmentation));
-        openings = line.openings;
-        if !openings.is_empty() {
-            warnings.push(openings::warning(&openings));
-        }
+    let over_mouth = |[a, b, c]: &[Vec3; 3]| is_open(&axis.project(&((a + b + c) / 3.0)));
+    if closes {
+        surface_under_repair.mark_filled(over_mouth);
+    } else {
+        surface_under_repair.retain(|face| !over_mouth(face));
     }
     surface_under_repair.keep_largest();
     surface_under_repair.cut_narrow();
@@ -311,15 +323,38 @@ fn by_poisson(
     if mesh.faces().is_empty() {
         return Err(Error::NoSurface { points: surface });
     }
+    let closed_m2 = line.as_ref().and_then(|line| closed_m2(&mesh, line, axis, segmentation, settings));
+    let openings = line.map_or(Vec::new(), |line| line.openings);
+    if !openings.is_empty() {
+        warnings.push(openings::warning(&openings, closed_m2));
+    }
     let (mesh, thinned) = thin(mesh, settings);
     let mut summary = describe("poisson", reason, &mesh, axis, openings, warnings);
+    summary.openings_closed_m2 = closed_m2;
     summary.decimate = thinned;
     summary.poisson = Some(poisson);
     summary.repair = Some(repaired);
     Ok((mesh, summary))
 }
 
-/// One component without handles, with its small holes closed.
+/// Area of the surface that closes side openings, square metres; `None` when none was to be closed.
+fn closed_m2(
+    mesh: &Mesh,
+    line: &section::WallLine,
+    axis: &Axis,
+    segmentation: &Segmentation,
+    settings: &Settings,
+) -> Option<f64> {
+    let closes = settings.side_openings == SideOpenings::Close && !line.openings.is_empty();
+    let over_mouth = |face: FaceId| {
+        let [a, b, c] = mesh.corners(face);
+        line.is_open(&axis.project(&((a + b + c) / 3.0)), &segmentation.section)
+    };
+    let filled = || (0..mesh.faces().len() as FaceId).filter(|&f| !mesh.observed()[f as usize]);
+    closes.then(|| filled().filter(|&f| over_mouth(f)).map(|f| mesh.double_area_vector(f).norm() / 2.0).sum())
+}
+
+/// One component without caps and handles, with its small holes closed.
 fn finish(
     mut surface: repair::Repaired,
     axis: &Axis,
@@ -468,6 +503,7 @@ fn check(settings: &Settings) -> Result<(), Error> {
     match settings.spacing_m {
         Some(value) if !positive(value) => {
             return Err(Error::Setting { key: "spacing_m", value, must: "must be a positive number of metres" });
+        openings_closed_m2: None,
         }
         _ => {}
     }
@@ -554,6 +590,37 @@ mod tests {
             Vec3::new(10.0, 0.0, -1.0) + Vec3::new(r * cos, r * sin, z) * 1.1
         }));
         let (segmentation, _) = classify_positions(&points, &axis(), &segment::Settings::default()).unwrap();
+    #[test]
+    fn a_closed_side_drift_is_wall_that_nobody_saw() {
+        let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
+        for method in [Method::Section, Method::Poisson] {
+            let settings = Settings { method, side_openings: SideOpenings::Close, ..Settings::default() };
+            let (mesh, summary) = reconstruct(&segmentation, &axis(), &settings).unwrap();
+            let borders = &summary.borders;
+            assert_eq!((borders.portals, borders.side_openings, borders.holes), (2, 0, 0), "{method:?} {borders:?}");
+            assert_eq!(summary.openings.len(), 1);
+            let mut filled_m2 = 0.0;
+            for f in 0..mesh.faces().len() {
+                let [a, b, c] = mesh.corners(f as u32);
+                let m = (a + b + c) / 3.0;
+                let from_middle = (m.x - 10.0).hypot(m.z);
+                if m.y > 0.0 && from_middle < 0.55 {
+                    assert!(!mesh.observed()[f], "{method:?}: {m} was not seen");
+                    assert!((m.y.hypot(m.z) - 2.0).abs() < 0.08, "{method:?}: {m} is off the wall line");
+                    filled_m2 += mesh.double_area_vector(f as u32).norm() / 2.0;
+                }
+            }
+            let told = summary.openings_closed_m2.unwrap();
+            // The mouth is 1.6 m wide, and its rim counts as wall where a cheek is not far behind it.
+            assert!(
+                filled_m2 > 0.85 && (filled_m2..2.8).contains(&told),
+                "{method:?}: {told}, {filled_m2} well inside"
+            );
+            let warning = summary.warnings.iter().find(|w| w.code == "side-openings").unwrap();
+            assert!(warning.message.contains(&format!("{told:.1} m2 of wall that nobody saw")), "{}", warning.message);
+        }
+    }
+
         let with = |method| reconstruct(&segmentation, &axis(), &Settings { method, ..Settings::default() }).unwrap();
         let (_, set) = with(Method::Section);
         assert_eq!(set.method, "section");

@@ -329,6 +329,13 @@ fn turn_to_one_side(faces: &mut [[VertexId; 3]]) -> usize {
             let start = |c: u32| faces[(c / 3) as usize][(c % 3) as usize];
             let same = start(a) == start(b);
             beside[a as usize] = Some((b / 3, same));
+    /// Marks the faces for which `is_filled` holds as not observed.
+    pub fn mark_filled(&mut self, is_filled: impl Fn(&[Vec3; 3]) -> bool) {
+        for (face, seen) in self.faces.iter().zip(&mut self.observed) {
+            *seen &= !is_filled(&face.map(|v| self.vertices[v as usize]));
+        }
+    }
+
             beside[b as usize] = Some((a / 3, same));
         }
     }

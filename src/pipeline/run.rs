@@ -44,7 +44,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "mesh", version: 6, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },
     Stage { name: "unwrap", version: 4, needs: &["cut", "axis"] },
-    Stage { name: "anchor", version: 3, needs: &["unwrap", "ingest"] },
+    Stage { name: "anchor", version: 4, needs: &["unwrap", "ingest"] },
     Stage { name: "map", version: 4, needs: &["anchor", "unwrap", "mesh", "ingest"] },
     Stage { name: "points", version: 2, needs: &["anchor", "mesh", "ingest"] },
     Stage { name: "profile", version: 1, needs: &["map", "anchor", "unwrap", "mesh", "axis"] },
