@@ -76,7 +76,8 @@ pub(super) fn turns(axis: &Axis, border: &[Vec3]) -> i64 {
     whole_turns(&angles)
 }
 
-fn whole_turns(angles: &[f64]) -> i64 {
+/// Whole turns of a closed line of angles.
+pub(super) fn whole_turns(angles: &[f64]) -> i64 {
     let sum: f64 = (0..angles.len()).map(|i| wrap_angle(angles[(i + 1) % angles.len()] - angles[i])).sum();
     (sum / TAU).round() as i64
 }

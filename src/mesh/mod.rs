@@ -8,6 +8,7 @@ pub mod poisson;
 mod void_side;
 mod surface_nets;
 pub mod repair;
+mod caps;
 mod handles;
 mod narrow;
 mod fill;

@@ -362,6 +362,7 @@ fn finish(
     warnings: &mut Vec<Warning>,
 ) -> (Mesh, repair::Summary) {
     surface.keep_largest();
+    let caps = surface.cut_caps(axis);
     surface.cut_handles();
     if settings.fill_hole_m > 0.0 {
         surface.fill_holes(settings.fill_hole_m, |border| borders::turns(axis, border) == 0);
@@ -369,6 +370,18 @@ fn finish(
     // A cut may have parted what only hung together over the rim of a hole.
     surface.keep_largest();
     let (mesh, summary) = surface.into_mesh();
+    if !caps.is_empty() {
+        let places: Vec<String> = caps.iter().map(|c| format!("{c:.1}")).collect();
+        warnings.push(Warning::new(
+            "caps-cut",
+            format!(
+                "the surface ran across the tunnel at chainage {} m (a cap of the program that made it, or a face of rock): \
+                 {:.1} m2 were cut off there, because a map needs both ends open; they are not on the map",
+                places.join(" and "),
+                summary.caps_m2
+            ),
+        ));
+    }
     if summary.handles_cut > 0 {
         warnings.push(Warning::new(
             "handles-cut",
@@ -490,6 +503,7 @@ fn describe(
         boundary_loops: borders.portals + borders.open_edges + borders.side_openings + borders.holes,
         borders,
         openings,
+        openings_closed_m2: None,
         section: None,
         poisson: None,
         decimate: None,
@@ -503,7 +517,6 @@ fn check(settings: &Settings) -> Result<(), Error> {
     match settings.spacing_m {
         Some(value) if !positive(value) => {
             return Err(Error::Setting { key: "spacing_m", value, must: "must be a positive number of metres" });
-        openings_closed_m2: None,
         }
         _ => {}
     }
@@ -578,19 +591,6 @@ mod tests {
     }
 
     #[test]
-    fn the_method_follows_what_hides_and_whether_it_can_be_opened() {
-        // A boulder of 1.1 m on the floor that holds three times the points of the walls.
-        let mut points = drift();
-        points.retain(|p| p.y < 2.1);
-        let count = 3 * points.len();
-        points.extend((0..count).map(|i| {
-            let z = 1.0 - 2.0 * (i as f64 + 0.5) / count as f64;
-            let (sin, cos) = (2.399_963_229_728_653 * i as f64).sin_cos();
-            let r = (1.0 - z * z).sqrt();
-            Vec3::new(10.0, 0.0, -1.0) + Vec3::new(r * cos, r * sin, z) * 1.1
-        }));
-        let (segmentation, _) = classify_positions(&points, &axis(), &segment::Settings::default()).unwrap();
-    #[test]
     fn a_closed_side_drift_is_wall_that_nobody_saw() {
         let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
         for method in [Method::Section, Method::Poisson] {
@@ -621,6 +621,19 @@ mod tests {
         }
     }
 
+    #[test]
+    fn the_method_follows_what_hides_and_whether_it_can_be_opened() {
+        // A boulder of 1.1 m on the floor that holds three times the points of the walls.
+        let mut points = drift();
+        points.retain(|p| p.y < 2.1);
+        let count = 3 * points.len();
+        points.extend((0..count).map(|i| {
+            let z = 1.0 - 2.0 * (i as f64 + 0.5) / count as f64;
+            let (sin, cos) = (2.399_963_229_728_653 * i as f64).sin_cos();
+            let r = (1.0 - z * z).sqrt();
+            Vec3::new(10.0, 0.0, -1.0) + Vec3::new(r * cos, r * sin, z) * 1.1
+        }));
+        let (segmentation, _) = classify_positions(&points, &axis(), &segment::Settings::default()).unwrap();
         let with = |method| reconstruct(&segmentation, &axis(), &Settings { method, ..Settings::default() }).unwrap();
         let (_, set) = with(Method::Section);
         assert_eq!(set.method, "section");
