@@ -137,7 +137,7 @@ pub enum Source {
 }
 
 /// On which side of the main tunnel something lies, facing increasing chainage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Side {
     /// Left wall.
@@ -148,6 +148,19 @@ pub enum Side {
     Above,
     /// Invert.
     Below,
+}
+
+impl Side {
+    /// The side on which a place lies: the nearest of the four directions.
+    pub fn of(c: &AxisCoordinates) -> Self {
+        if c.up.abs() > c.right.abs() {
+            if c.up > 0.0 { Self::Above } else { Self::Below }
+        } else if c.right > 0.0 {
+            Self::Right
+        } else {
+            Self::Left
+        }
+    }
 }
 
 /// A side drift.
@@ -676,17 +689,14 @@ fn branches(skeleton: &Skeleton, axis: &Axis, radius_m: f64) -> Vec<Branch> {
             }
             let frame = axis.frame_at(mouth.chainage);
             let towards = rough.middle - frame.origin;
-            let (right, up) = (-towards.dot(&frame.left), towards.dot(&frame.up));
-            let side = if up.abs() > right.abs() {
-                if up > 0.0 { Side::Above } else { Side::Below }
-            } else if right > 0.0 {
-                Side::Right
-            } else {
-                Side::Left
+            let middle = AxisCoordinates {
+                chainage: mouth.chainage,
+                right: -towards.dot(&frame.left),
+                up: towards.dot(&frame.up),
             };
             Some(Branch {
                 chainage_m: mouth.chainage,
-                side,
+                side: Side::of(&middle),
                 length_m: rough.length_m,
                 middle_in_local: rough.middle.into(),
             })

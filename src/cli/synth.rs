@@ -9,8 +9,8 @@ use crate::synthetic::{self, Course, Kind, Part, Recipe, Shape, Surface, Synthet
 use std::path::PathBuf;
 
 /// Classes that `--truth` writes: LAS codes where there is one, user codes otherwise.
-const TRUTH_CLASSES: [(Surface, u8); 4] =
-    [(Surface::Wall, 64), (Surface::Floor, 2), (Surface::Furniture, 65), (Surface::Outlier, 7)];
+const TRUTH_CLASSES: [(Surface, u8); 5] =
+    [(Surface::Wall, 64), (Surface::Floor, 2), (Surface::Furniture, 65), (Surface::Outside, 66), (Surface::Outlier, 7)];
 
 const EXAMPLES: &str = "\
 Examples:
@@ -18,10 +18,11 @@ Examples:
   adit synth --out shaft.laz --section circle:2.5 --alignment shaft --furniture cables
   adit synth --out long.las --length 200 --stations 16 --points 20000000 --section horseshoe:8.2x6.7
   adit synth --out truth.ply --truth --noise-mm 3                with true class, chainage and girth of every point
+  adit synth --out junction.laz --furniture crosscut,niche,duct  a side drift on the right, a recess on the left
 
 --truth writes the columns chainage and girth (as measured around the smooth section), offset (relief), the LAS
-classification of each point (64 wall, 2 floor, 65 furniture, 7 outlier) and surface_class, as `adit run` writes what it
-found (0 wall, 1 floor, 2 furniture, 4 noise).";
+classification of each point (64 wall, 2 floor, 65 furniture, 66 side drift, 7 outlier) and surface_class, as `adit run`
+writes what it found (0 wall, 1 floor, 2 furniture, 3 outside, 4 noise). Furniture, recesses and outliers have no girth.";
 
 /// Arguments of `adit synth`.
 #[derive(clap::Args)]
@@ -60,7 +61,7 @@ pub struct Arguments {
     /// Text on the left wall; empty for none.
     #[arg(long, value_name = "TEXT", default_value = "L")]
     left_text: String,
-    /// What stands in the way, separated by commas; `none` for an empty tunnel.
+    /// What stands in the way and is cut into the walls, separated by commas; `none` for an empty tunnel.
     #[arg(long, value_name = "LIST", value_enum, value_delimiter = ',', default_value = "cables,vehicle")]
     furniture: Vec<FurnitureName>,
     /// Scanner stations, spread evenly.
@@ -128,7 +129,7 @@ enum PartName {
     Trench,
 }
 
-/// What may stand and hang in the tunnel.
+/// What may stand and hang in the tunnel, and be cut into its walls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum FurnitureName {
     /// An empty tunnel.
@@ -141,6 +142,10 @@ enum FurnitureName {
     Rails,
     /// A parked pick-up.
     Vehicle,
+    /// A side drift through the right wall, 2.5 m wide and high and 6 m deep.
+    Crosscut,
+    /// A recess in the left wall, 2 m wide and high and 1 m deep.
+    Niche,
 }
 
 impl Arguments {
@@ -189,6 +194,8 @@ fn kind(name: FurnitureName) -> Option<Kind> {
         FurnitureName::Cables => Some(Kind::Cables),
         FurnitureName::Rails => Some(Kind::Rails),
         FurnitureName::Vehicle => Some(Kind::Vehicle),
+        FurnitureName::Crosscut => Some(Kind::Crosscut),
+        FurnitureName::Niche => Some(Kind::Niche),
     }
 }
 
@@ -249,6 +256,7 @@ fn class_of(surface: Surface) -> Class {
         Surface::Wall => Class::Wall,
         Surface::Floor => Class::Floor,
         Surface::Furniture => Class::Furniture,
+        Surface::Outside => Class::Outside,
         Surface::Outlier => Class::Noise,
     }
 }

@@ -11,7 +11,9 @@
 //! starts at the nearest face and walks across the side that p lies behind.
 //!
 //! Points beyond the border of the surface (or of a hole) lie in no prism. They are clamped to the nearest place and
-//! marked, because they do not come back exactly. Points farther than `max_offset_m` are not anchored.
+//! marked, because they do not come back exactly. Points farther than `max_offset_m` are not anchored, nor are those behind
+//! surface that no scan point supports: they were cut off when the wall was continued over an opening, and must not look like
+//! rock of the wall in front of them.
 //!
 //! Cost: about a microsecond a point; 29 bytes a point. Same anchors on any number of threads.
 //! Reference for the shell: S. Porumbescu, B. Budge, L. Feng, K. Joy, "Shell maps", SIGGRAPH 2005,
@@ -47,10 +49,15 @@ pub struct Summary {
     pub anchored: usize,
     /// Points beyond a border, clamped to it: they have a place, but do not come back exactly.
     pub clamped: usize,
-    /// Points farther from the surface than allowed (or not finite): no anchor.
+    /// Points farther from the surface than allowed (or not finite), or behind filled surface: no anchor.
     pub unanchored: usize,
+    /// Of these, the points behind filled surface.
+    pub behind_filled: usize,
 }
 
+/// A point farther than this behind surface that was not observed is no part of it, metres: the rim of a filled patch holds
+/// points of the wall as well, and a filled cleft those that were seen in it.
+const BEHIND_FILLED_M: f64 = 0.1;
 /// Marks points without an anchor.
 const NO_FACE: FaceId = FaceId::MAX;
 /// Points handled in one go; fixed, so that the first guess of the search does not depend on the thread count.
@@ -158,27 +165,34 @@ impl<'a> Anchoring<'a> {
             exact: vec![false; count],
         };
         let reach = settings.max_offset_m.max(0.0);
-        points
+        let behind_filled = points
             .par_chunks(CHUNK)
             .zip(anchors.faces.par_chunks_mut(CHUNK))
             .zip(anchors.weights.par_chunks_mut(CHUNK))
             .zip(anchors.offsets.par_chunks_mut(CHUNK))
             .zip(anchors.exact.par_chunks_mut(CHUNK))
-            .for_each(|((((points, faces), weights), offsets), exact)| {
-                let mut guess = None;
+            .map(|((((points, faces), weights), offsets), exact)| {
+                let (mut guess, mut behind_filled) = (None, 0);
                 for (i, p) in points.iter().enumerate() {
                     if let Some((anchor, is_exact)) = self.anchor_one(p, reach, guess) {
                         guess = Some(anchor.face);
+                        if anchor.offset < -BEHIND_FILLED_M && !self.mesh.observed()[anchor.face as usize] {
+                            behind_filled += 1;
+                            continue;
+                        }
                         faces[i] = anchor.face;
                         weights[i] = [anchor.barycentric[1], anchor.barycentric[2]];
                         offsets[i] = anchor.offset;
                         exact[i] = is_exact;
                     }
                 }
-            });
+                behind_filled
+            })
+            .sum();
         let anchored = anchors.exact.iter().filter(|&&e| e).count();
         let placed = anchors.faces.iter().filter(|&&f| f != NO_FACE).count();
-        let summary = Summary { points: count, anchored, clamped: placed - anchored, unanchored: count - placed };
+        let summary =
+            Summary { points: count, anchored, clamped: placed - anchored, unanchored: count - placed, behind_filled };
         (anchors, summary)
     }
 
@@ -391,11 +405,29 @@ mod tests {
     }
 
     #[test]
+    fn what_was_cut_off_behind_a_filled_patch_has_no_place() {
+        let whole = sheet();
+        let in_patch = |f: u32| {
+            let [a, b, c] = whole.corners(f);
+            let m = (a + b + c) / 3.0;
+            (1.0..3.0).contains(&m.x) && (1.0..3.0).contains(&m.y)
+        };
+        let observed = (0..whole.faces().len() as u32).map(|f| !in_patch(f)).collect();
+        let mesh = Mesh::new(whole.vertices().to_vec(), whole.faces().to_vec(), observed).unwrap();
+        let at = |x: f64, dz: f64| Vec3::new(x, 2.0, 0.15 * (4.0 * x).sin() * 6.0_f64.cos() + dz);
+        // Behind and before the patch, and behind what was seen.
+        let points = [at(2.0, -0.15), at(2.0, 0.15), at(0.5, -0.15)];
+        let (anchors, summary) = anchor_points(&mesh, &points, &Settings::default());
+        assert_eq!(summary, Summary { points: 3, anchored: 2, unanchored: 1, behind_filled: 1, ..Summary::default() });
+        assert!(anchors.get(0).is_none() && anchors.get(1).is_some() && anchors.get(2).is_some());
+    }
+
+    #[test]
     fn far_and_broken_points_are_counted() {
         let mesh = sheet();
         let points = [Vec3::new(2.0, 2.0, 3.0), Vec3::new(f64::NAN, 0.0, 0.0), Vec3::new(2.0, 2.0, 0.0)];
         let (anchors, summary) = anchor_points(&mesh, &points, &Settings::default());
-        assert_eq!(summary, Summary { points: 3, anchored: 1, clamped: 0, unanchored: 2 });
+        assert_eq!(summary, Summary { points: 3, anchored: 1, unanchored: 2, ..Summary::default() });
         assert_eq!((anchors.get(0), anchors.get(1)), (None, None));
         assert!(anchors.offsets()[0].is_nan());
     }

@@ -2,11 +2,13 @@
 
 pub mod reconstruct;
 pub mod openings;
+pub mod borders;
 pub mod section;
 pub mod poisson;
 mod void_side;
 mod surface_nets;
 pub mod repair;
+mod caps;
 mod handles;
 mod narrow;
 mod fill;
@@ -16,6 +18,7 @@ pub mod nearest_face;
 pub mod surface_point;
 pub mod topology;
 
+pub use borders::Borders;
 pub use reconstruct::{Method, Settings, Summary, is_in_pieces, reconstruct, sample_faces, take_over};
 pub use surface_point::SurfacePoint;
 

@@ -3,11 +3,11 @@
 //! On the unrolled grid an opening begins at cells that hold points far behind the wall (class *outside*) and no wall in
 //! front of them; it takes in all cells around that lie behind the wall line by more than `BEHIND_IN_RADII`, so that
 //! the cheeks and the floor of a side drift go with it. Relief that leads nowhere (a niche, an overbreak) is no opening.
-//! The surface is then cut off at the wall line: the opening stays a hole.
+//! The surface is then cut off at the wall line. The opening stays a hole, or the wall line is continued over it.
 //!
 //! Cost: linear in points and cells.
 
-use crate::axis::{Axis, Side};
+use crate::axis::{Axis, AxisCoordinates, Side};
 use crate::numeric::Vec3;
 use crate::segment::unrolled_grid::Grid;
 use crate::segment::{Class, SectionField, Segmentation};
@@ -32,6 +32,8 @@ pub enum SideOpenings {
     /// They stay holes whose rim is the wall line.
     #[default]
     Hole,
+    /// They are cut off and the wall line is continued over them, however wide: surface that nobody saw, marked as filled.
+    Close,
     /// Nothing is cut off: what was seen of the side drift stays part of the surface.
     Keep,
 }
@@ -41,6 +43,8 @@ pub enum SideOpenings {
 pub struct SideOpening {
     /// Chainage of its middle, metres.
     pub chainage_m: f64,
+    /// Angle of its middle around the axis, degrees: 0 at the crown, 90 on the right wall.
+    pub angle_deg: f64,
     /// The side on which it leaves, facing increasing chainage.
     pub side: Side,
     /// Extent along the tunnel and around the section, metres.
@@ -59,8 +63,8 @@ pub(super) fn behind_m(section: &SectionField) -> f64 {
     BEHIND_IN_RADII * section.mean_perimeter() / TAU
 }
 
-/// What a person should know of the openings.
-pub(super) fn warning(openings: &[SideOpening]) -> Warning {
+/// What a person should know of openings that were cut off: left as holes, or closed by so many square metres.
+pub(super) fn warning(openings: &[SideOpening], closed_m2: Option<f64>) -> Warning {
     let list: Vec<String> = openings
         .iter()
         .map(|o| {
@@ -68,10 +72,14 @@ pub(super) fn warning(openings: &[SideOpening]) -> Warning {
             format!("{side} at {:.1} m ({:.1} m wide, seen {:.1} m deep)", o.chainage_m, o.width_m[0], o.seen_depth_m)
         })
         .collect();
+    let became = match closed_m2 {
+        None => "left as holes".to_owned(),
+        Some(m2) => format!("closed by {m2:.1} m2 of wall that nobody saw (filled, not observed)"),
+    };
     Warning::new(
         "side-openings",
         format!(
-            "{} side opening(s) were cut off at the wall line and left as holes: {}; mesh.side_openings changes that, and \
+            "{} side opening(s) were cut off at the wall line and {became}: {}; mesh.side_openings changes that, and \
              axis.ends follows a side drift in a run of its own",
             openings.len(),
             list.join("; ")
@@ -98,8 +106,7 @@ pub(super) fn find(
             continue;
         }
         let p = grid.unroll(section, c);
-        if p.depth > behind && p.row >= 0.0 && p.row < grid.rows as f64 {
-            let cell = p.row as usize * grid.columns + (p.column as usize).min(grid.columns - 1);
+        if let Some(cell) = grid.cell_at(&p).filter(|_| p.depth > behind) {
             points_in[cell].push((i as u32, p.depth));
         }
     }
@@ -132,18 +139,62 @@ pub(super) fn find(
     let mut found = Vec::new();
     for mut region in regions {
         region.sort_unstable();
-        let opening = describe(grid, segmentation, axis, &region, &points_in);
+        let extent = Extent::of(grid, &region);
+        let opening = describe(grid, segmentation, axis, &region, &extent, &points_in);
         let wide = opening.width_m.iter().all(|w| *w >= LEAST_WIDTH_IN_RADII * mean_radius);
         // What fills half the section is no opening in a wall; the section itself is not understood there.
         let half_the_section = opening.width_m[1] > 0.6 * section.mean_perimeter();
         if wide && !half_the_section && opening.seen_depth_m >= LEAST_DEPTH_IN_RADII * mean_radius {
-            region.iter().for_each(|&c| open[c] = true);
+            take(grid, depth, region, &extent, &mut open);
             found.push(opening);
         }
     }
     enclose(grid, depth, &mut open);
     found.sort_by(|a, b| a.chainage_m.total_cmp(&b.chainage_m));
     (open, found)
+}
+
+/// The rows and columns that a region of cells spans, first and last.
+struct Extent {
+    rows: [usize; 2],
+    columns: [usize; 2],
+    /// Columns are counted from the one opposite to this one, the region's first, so that the invert does not part them.
+    reference: usize,
+}
+
+impl Extent {
+    /// Of a region whose cells ascend.
+    fn of(grid: &Grid, region: &[usize]) -> Self {
+        let rows = [region[0] / grid.columns, region[region.len() - 1] / grid.columns];
+        let mut extent = Self { rows, columns: [usize::MAX, 0], reference: region[0] % grid.columns };
+        let columns = region.iter().map(|&c| extent.column(grid, c));
+        extent.columns = columns.fold([usize::MAX, 0], |[low, high], c| [low.min(c), high.max(c)]);
+        extent
+    }
+
+    fn column(&self, grid: &Grid, cell: usize) -> usize {
+        (cell % grid.columns + grid.columns + grid.columns / 2 - self.reference) % grid.columns
+    }
+
+    fn holds(&self, grid: &Grid, cell: usize) -> bool {
+        let between = |[first, last]: [usize; 2], at: usize| first <= at && at <= last;
+        between(self.rows, cell / grid.columns) && between(self.columns, self.column(grid, cell))
+    }
+}
+
+/// Opens the cells of a region, and the empty ones that hang together with them within its extent: a side drift is seen
+/// aslant, and where one looks far into it nothing lies over the middle of its mouth.
+fn take(grid: &Grid, depth: &[f64], region: Vec<usize>, extent: &Extent, open: &mut [bool]) {
+    region.iter().for_each(|&c| open[c] = true);
+    let mut front = region;
+    while let Some(cell) = front.pop() {
+        for n in grid.neighbours(cell, 1) {
+            if !open[n] && depth[n].is_nan() && extent.holds(grid, n) {
+                open[n] = true;
+                front.push(n);
+            }
+        }
+    }
 }
 
 /// Empty cells between the cells of openings belong to them: two steps of growth into cells without surface.
@@ -161,27 +212,16 @@ fn describe(
     segmentation: &Segmentation,
     axis: &Axis,
     region: &[usize],
+    extent: &Extent,
     points_in: &[Vec<(u32, f64)>],
 ) -> SideOpening {
     let section = &segmentation.section;
-    let rows: Vec<usize> = region.iter().map(|c| c / grid.columns).collect();
-    let (first, last) = (rows[0], rows[rows.len() - 1]);
-    // Columns are counted from the one opposite to the region's first, so that the invert does not part them.
-    let reference = region[0] % grid.columns;
-    let half = grid.columns / 2;
-    let shifted = |c: usize| (c % grid.columns + grid.columns + half - reference) % grid.columns;
-    let low = region.iter().map(|&c| shifted(c)).min().unwrap_or(half);
-    let high = region.iter().map(|&c| shifted(c)).max().unwrap_or(half);
+    let ([first, last], [low, high]) = (extent.rows, extent.columns);
     let chainage_m = grid.start + (first + last + 1) as f64 / 2.0 * grid.row_m;
-    let column = ((low + high + 1) as f64 / 2.0 + reference as f64 - half as f64).rem_euclid(grid.columns as f64);
+    let turn = extent.reference as f64 - (grid.columns / 2) as f64;
+    let column = ((low + high + 1) as f64 / 2.0 + turn).rem_euclid(grid.columns as f64);
     let (left, right) = section.girth_range(chainage_m);
     let angle = section.angle_of_girth(chainage_m, left + (right - left) * column / grid.columns as f64);
-    let side = match angle.to_degrees() {
-        a if a.abs() <= 45.0 => Side::Above,
-        a if a.abs() >= 135.0 => Side::Below,
-        a if a > 0.0 => Side::Right,
-        _ => Side::Left,
-    };
     let mut behind: Vec<(u32, f64)> = region.iter().flat_map(|&c| points_in[c].iter().copied()).collect();
     behind.sort_unstable_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
     let far =
@@ -192,7 +232,8 @@ fn describe(
     let seen_depth_m = far.last().map_or(0.0, |f| f.1);
     SideOpening {
         chainage_m,
-        side,
+        angle_deg: angle.to_degrees(),
+        side: Side::of(&AxisCoordinates::from_polar(chainage_m, angle, 1.0)),
         width_m: [(last - first + 1) as f64 * grid.row_m, (high - low + 1) as f64 * grid.column_m],
         seen_depth_m,
         points: behind.len(),

@@ -1,16 +1,16 @@
 //! The verb of the mesh stage: from classified points, or from faces made elsewhere, to one oriented manifold.
 
+use super::borders::{self, Borders};
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
-use super::{Mesh, VertexId, poisson, repair, section, topology};
+use super::{FaceId, Mesh, VertexId, poisson, repair, section, topology};
 use crate::axis::{Axis, AxisCoordinates};
-use crate::numeric::{Vec3, wrap_angle};
+use crate::numeric::Vec3;
 use crate::segment::{Class, Segmentation};
 use crate::warning::Warning;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::f64::consts::TAU;
 
 /// Above this share of cells with several depths the section method loses too much of the surface, percent.
 const MANY_DEPTHS_PERCENT: f64 = 5.0;
@@ -55,8 +55,8 @@ pub struct Settings {
     /// The wall behind ducts, cables and other furniture is filled and marked where its shadow is narrower than this,
     /// metres; 0 leaves holes. Only the section method knows where the wall goes on.
     pub fill_behind_furniture_m: f64,
-    /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim,
-    /// `"keep"` keeps what was seen of it.
+    /// Side drifts, niches and rooms that open into the wall: `"hole"` leaves a hole with the wall line as its rim, `"close"`
+    /// continues the wall over it, however wide, and marks that as filled, `"keep"` keeps what was seen of it.
     pub side_openings: SideOpenings,
     /// Thins the mesh: `{ faces = N }` down to a number of faces, `{ deviation_m = X }` as far as the surface moves no
     /// more than that. Not thinned when not given.
@@ -92,10 +92,15 @@ pub struct Summary {
     pub area_m2: f64,
     /// Share of the area that no point supports (filled holes), percent.
     pub filled_percent: f64,
-    /// Boundary loops: two portals and the holes that stayed.
+    /// All boundary loops: those that `borders` tells apart.
     pub boundary_loops: usize,
+    /// The borders by what they are.
+    pub borders: Borders,
     /// Side drifts, niches and rooms that open into the wall.
     pub openings: Vec<SideOpening>,
+    /// Surface that nobody saw, over side openings that were closed, square metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub openings_closed_m2: Option<f64>,
     /// Numbers of the section method.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub section: Option<section::Summary>,
@@ -156,7 +161,8 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
     }
     let count = |class: Class| segmentation.class.iter().filter(|k| **k == class).count();
     let points = segmentation.class.iter().filter(|c| c.is_surface()).count();
-    let (mesh, section) = section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
+    let (mesh, section, line) =
+        section::reconstruct(segmentation, axis, &options).ok_or(Error::NoSurface { points })?;
     let share = section.multiple_depth_percent;
     let mut reason = format!("{share:.2} % of the rays from the axis meet the surface more than once");
     let front = count(Class::Furniture);
@@ -193,13 +199,14 @@ pub fn reconstruct(segmentation: &Segmentation, axis: &Axis, settings: &Settings
             ),
         ));
     }
-    if !section.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
-        warnings.push(openings::warning(&section.openings));
+    let closed_m2 = closed_m2(&mesh, &line, axis, segmentation, settings);
+    if !line.openings.is_empty() && settings.side_openings != SideOpenings::Keep {
+        warnings.push(openings::warning(&line.openings, closed_m2));
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("section", reason, &mesh, warnings);
+    let mut summary = describe("section", reason, &mesh, axis, line.openings, warnings);
+    summary.openings_closed_m2 = closed_m2;
     summary.decimate = thinned;
-    summary.openings = section.openings.clone();
     summary.section = Some(section);
     Ok((mesh, summary))
 }
@@ -219,7 +226,7 @@ fn cannot_be_opened(mesh: &Mesh, summary: &Summary, axis: &Axis, segmentation: &
     let borders = topology::boundary_loops(mesh.faces(), mesh.twins());
     let around: Vec<i64> = borders
         .iter()
-        .map(|border| turns(axis, &border.iter().map(|&v| mesh.vertices()[v as usize]).collect::<Vec<_>>()))
+        .map(|border| borders::turns(axis, &border.iter().map(|&v| mesh.vertices()[v as usize]).collect::<Vec<_>>()))
         .filter(|t| *t != 0)
         .collect();
     (around.len() > 2 || around.iter().any(|t| t.abs() > 1))
@@ -258,13 +265,21 @@ fn by_poisson(
     let compressed = poisson::Compressed::for_profiles(&segmentation.sampling, axis, &poisson_options);
     let place = |c: &AxisCoordinates| compressed.as_ref().map_or_else(|| axis.point_at(c), |k| k.place(c));
     let classified = || segmentation.coordinates.par_iter().zip(&segmentation.class);
-    let points: Vec<Vec3> = classified()
+    let line = (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let is_open = |c: &AxisCoordinates| line.as_ref().is_some_and(|l| l.is_open(c, &segmentation.section));
+    let closes = settings.side_openings == SideOpenings::Close;
+    let mut points: Vec<Vec3> = classified()
         .filter(|(_, k)| k.is_surface() || (rock_in_front && **k == Class::Furniture))
+        .filter(|(c, _)| !(closes && is_open(c)))
         .map(|(c, _)| place(c))
         .collect();
-    let walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
-    let wall_line =
-        (settings.side_openings != SideOpenings::Keep).then(|| section::wall_line(segmentation, axis, options));
+    let mut walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
+    if let Some(line) = line.as_ref().filter(|_| closes) {
+        // The wall line stands in for what was seen behind it, so that the surface runs on over the mouth.
+        let drawn: Vec<Vec3> = line.continued(&segmentation.section).iter().map(place).collect();
+        walls.extend(&drawn);
+        points.extend(drawn);
+    }
     let (mut raw, mut poisson) = match &compressed {
         Some(k) => {
             let options = poisson::Options { spacing_m: Some(k.cell_m), ..poisson_options };
@@ -287,13 +302,11 @@ fn by_poisson(
     }
     warnings.extend(poisson.warning(settings.spacing_m));
     let mut surface_under_repair = repair::Repaired::of(raw.vertices, raw.faces, raw.observed);
-    let mut openings = Vec::new();
-    if let Some(line) = wall_line {
-        surface_under_repair.retain(|[a, b, c]| !line.is_open(&axis.project(&((a + b + c) / 3.0)), segmentation));
-        openings = line.openings;
-        if !openings.is_empty() {
-            warnings.push(openings::warning(&openings));
-        }
+    let over_mouth = |[a, b, c]: &[Vec3; 3]| is_open(&axis.project(&((a + b + c) / 3.0)));
+    if closes {
+        surface_under_repair.mark_filled(over_mouth);
+    } else {
+        surface_under_repair.retain(|face| !over_mouth(face));
     }
     surface_under_repair.keep_largest();
     surface_under_repair.cut_narrow();
@@ -310,16 +323,38 @@ fn by_poisson(
     if mesh.faces().is_empty() {
         return Err(Error::NoSurface { points: surface });
     }
+    let closed_m2 = line.as_ref().and_then(|line| closed_m2(&mesh, line, axis, segmentation, settings));
+    let openings = line.map_or(Vec::new(), |line| line.openings);
+    if !openings.is_empty() {
+        warnings.push(openings::warning(&openings, closed_m2));
+    }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("poisson", reason, &mesh, warnings);
+    let mut summary = describe("poisson", reason, &mesh, axis, openings, warnings);
+    summary.openings_closed_m2 = closed_m2;
     summary.decimate = thinned;
-    summary.openings = openings;
     summary.poisson = Some(poisson);
     summary.repair = Some(repaired);
     Ok((mesh, summary))
 }
 
-/// One component without handles, with its small holes closed.
+/// Area of the surface that closes side openings, square metres; `None` when none was to be closed.
+fn closed_m2(
+    mesh: &Mesh,
+    line: &section::WallLine,
+    axis: &Axis,
+    segmentation: &Segmentation,
+    settings: &Settings,
+) -> Option<f64> {
+    let closes = settings.side_openings == SideOpenings::Close && !line.openings.is_empty();
+    let over_mouth = |face: FaceId| {
+        let [a, b, c] = mesh.corners(face);
+        line.is_open(&axis.project(&((a + b + c) / 3.0)), &segmentation.section)
+    };
+    let filled = || (0..mesh.faces().len() as FaceId).filter(|&f| !mesh.observed()[f as usize]);
+    closes.then(|| filled().filter(|&f| over_mouth(f)).map(|f| mesh.double_area_vector(f).norm() / 2.0).sum())
+}
+
+/// One component without caps and handles, with its small holes closed.
 fn finish(
     mut surface: repair::Repaired,
     axis: &Axis,
@@ -327,13 +362,26 @@ fn finish(
     warnings: &mut Vec<Warning>,
 ) -> (Mesh, repair::Summary) {
     surface.keep_largest();
+    let caps = surface.cut_caps(axis);
     surface.cut_handles();
     if settings.fill_hole_m > 0.0 {
-        surface.fill_holes(settings.fill_hole_m, |border| turns(axis, border) == 0);
+        surface.fill_holes(settings.fill_hole_m, |border| borders::turns(axis, border) == 0);
     }
     // A cut may have parted what only hung together over the rim of a hole.
     surface.keep_largest();
     let (mesh, summary) = surface.into_mesh();
+    if !caps.is_empty() {
+        let places: Vec<String> = caps.iter().map(|c| format!("{c:.1}")).collect();
+        warnings.push(Warning::new(
+            "caps-cut",
+            format!(
+                "the surface ran across the tunnel at chainage {} m (a cap of the program that made it, or a face of rock): \
+                 {:.1} m2 were cut off there, because a map needs both ends open; they are not on the map",
+                places.join(" and "),
+                summary.caps_m2
+            ),
+        ));
+    }
     if summary.handles_cut > 0 {
         warnings.push(Warning::new(
             "handles-cut",
@@ -356,13 +404,6 @@ fn thin(mesh: Mesh, settings: &Settings) -> (Mesh, Option<decimate::Summary>) {
         }
         None => (mesh, None),
     }
-}
-
-/// Whole turns of a border around the axis.
-fn turns(axis: &Axis, border: &[Vec3]) -> i64 {
-    let angles: Vec<f64> = border.iter().map(|p| axis.project(p).angle()).collect();
-    let sum: f64 = (0..angles.len()).map(|i| wrap_angle(angles[(i + 1) % angles.len()] - angles[i])).sum();
-    (sum / TAU).round() as i64
 }
 
 /// Whether a mesh from elsewhere falls into pieces that have to be made into one surface: then [`sample_faces`] and
@@ -431,19 +472,27 @@ pub fn take_over(
         ));
     }
     let (mesh, thinned) = thin(mesh, settings);
-    let mut summary = describe("given", "the input is a mesh".to_owned(), &mesh, warnings);
+    let mut summary = describe("given", "the input is a mesh".to_owned(), &mesh, axis, Vec::new(), warnings);
     summary.decimate = thinned;
     summary.repair = Some(repaired);
     Ok((mesh, summary))
 }
 
-fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<Warning>) -> Summary {
+fn describe(
+    method: &'static str,
+    reason: String,
+    mesh: &Mesh,
+    axis: &Axis,
+    openings: Vec<SideOpening>,
+    mut warnings: Vec<Warning>,
+) -> Summary {
     let area_m2 = mesh.area();
     let filled: f64 = (0..mesh.faces().len())
         .filter(|&f| !mesh.observed()[f])
         .map(|f| mesh.double_area_vector(f as u32).norm() / 2.0)
         .sum();
-    let twin = mesh.twins();
+    let borders = Borders::of(mesh, axis, &openings);
+    warnings.extend(borders.warning(axis));
     Summary {
         method,
         reason,
@@ -451,8 +500,10 @@ fn describe(method: &'static str, reason: String, mesh: &Mesh, warnings: Vec<War
         faces: mesh.faces().len(),
         area_m2,
         filled_percent: 100.0 * filled / area_m2,
-        boundary_loops: topology::boundary_loops(mesh.faces(), twin).len(),
-        openings: Vec::new(),
+        boundary_loops: borders.portals + borders.open_edges + borders.side_openings + borders.holes,
+        borders,
+        openings,
+        openings_closed_m2: None,
         section: None,
         poisson: None,
         decimate: None,
@@ -495,6 +546,7 @@ fn check(settings: &Settings) -> Result<(), Error> {
 mod tests {
     use super::*;
     use crate::segment::{self, classify_positions};
+    use std::f64::consts::TAU;
 
     fn axis() -> Axis {
         Axis::through(&[Vec3::zeros(), Vec3::new(20.0, 0.0, 0.0)], 0.0).unwrap()
@@ -535,6 +587,37 @@ mod tests {
             let most = if method == Method::Section { 3 } else { 5 };
             assert!((3..=most).contains(&summary.boundary_loops), "{method:?}: {}", summary.boundary_loops);
             assert!(summary.warnings.iter().any(|w| w.code == "side-openings"));
+        }
+    }
+
+    #[test]
+    fn a_closed_side_drift_is_wall_that_nobody_saw() {
+        let (segmentation, _) = classify_positions(&drift(), &axis(), &segment::Settings::default()).unwrap();
+        for method in [Method::Section, Method::Poisson] {
+            let settings = Settings { method, side_openings: SideOpenings::Close, ..Settings::default() };
+            let (mesh, summary) = reconstruct(&segmentation, &axis(), &settings).unwrap();
+            let borders = &summary.borders;
+            assert_eq!((borders.portals, borders.side_openings, borders.holes), (2, 0, 0), "{method:?} {borders:?}");
+            assert_eq!(summary.openings.len(), 1);
+            let mut filled_m2 = 0.0;
+            for f in 0..mesh.faces().len() {
+                let [a, b, c] = mesh.corners(f as u32);
+                let m = (a + b + c) / 3.0;
+                let from_middle = (m.x - 10.0).hypot(m.z);
+                if m.y > 0.0 && from_middle < 0.55 {
+                    assert!(!mesh.observed()[f], "{method:?}: {m} was not seen");
+                    assert!((m.y.hypot(m.z) - 2.0).abs() < 0.08, "{method:?}: {m} is off the wall line");
+                    filled_m2 += mesh.double_area_vector(f as u32).norm() / 2.0;
+                }
+            }
+            let told = summary.openings_closed_m2.unwrap();
+            // The mouth is 1.6 m wide, and its rim counts as wall where a cheek is not far behind it.
+            assert!(
+                filled_m2 > 0.85 && (filled_m2..2.8).contains(&told),
+                "{method:?}: {told}, {filled_m2} well inside"
+            );
+            let warning = summary.warnings.iter().find(|w| w.code == "side-openings").unwrap();
+            assert!(warning.message.contains(&format!("{told:.1} m2 of wall that nobody saw")), "{}", warning.message);
         }
     }
 

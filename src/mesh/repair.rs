@@ -1,7 +1,8 @@
 //! Small repairs that turn a list of oriented triangles into one oriented manifold: every change is counted.
 
 use super::topology::{self, NO_TWIN};
-use super::{FaceId, Mesh, VertexId, fill, handles, narrow};
+use super::{FaceId, Mesh, VertexId, caps, fill, handles, narrow};
+use crate::axis::Axis;
 use crate::numeric::Vec3;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -139,6 +140,12 @@ pub struct Summary {
     pub faces_dropped: usize,
     /// Faces dropped because the surface closes around itself there within a few edges: fingers and throats.
     pub narrow_faces_dropped: usize,
+    /// Caps that closed the tube at its ends and were cut off.
+    pub caps_cut: usize,
+    /// Faces of these caps.
+    pub cap_faces_dropped: usize,
+    /// Area of these caps, square metres.
+    pub caps_m2: f64,
     /// Handles of the surface that were cut open.
     pub handles_cut: usize,
     /// Length of these cuts, metres.
@@ -261,6 +268,25 @@ impl Repaired {
         }
     }
 
+    /// Cuts off what closes the tube at the ends of the axis; returns the chainages of these caps, metres.
+    pub fn cut_caps(&mut self, axis: &Axis) -> Vec<f64> {
+        let Ok(twin) = topology::twins(&self.faces) else { return Vec::new() };
+        let caps = caps::find(&self.vertices, &self.faces, &twin, axis);
+        let mut stays = vec![true; self.faces.len()];
+        for cap in &caps {
+            cap.faces.iter().for_each(|&f| stays[f as usize] = false);
+            self.summary.cap_faces_dropped += cap.faces.len();
+            self.summary.caps_m2 += cap.area_m2;
+        }
+        self.summary.caps_cut += caps.len();
+        if !caps.is_empty() {
+            self.retain_marked(&stays);
+            // What stood on a cap hangs on nothing now.
+            self.keep_largest();
+        }
+        caps.into_iter().map(|c| c.chainage_m).collect()
+    }
+
     /// Cuts all handles open, keeping the largest component where a cut parts the surface.
     pub fn cut_handles(&mut self) {
         let left = |faces: &[[VertexId; 3]]| topology::twins(faces).map_or(0, |twin| handles::genus(faces, &twin));
@@ -294,9 +320,20 @@ impl Repaired {
     /// Leaves out the faces for which `keep` is false.
     pub fn retain(&mut self, keep: impl Fn(&[Vec3; 3]) -> bool) {
         let stays: Vec<bool> = self.faces.iter().map(|f| keep(&f.map(|v| self.vertices[v as usize]))).collect();
+        self.retain_marked(&stays);
+    }
+
+    fn retain_marked(&mut self, stays: &[bool]) {
         let all = std::mem::take(&mut self.faces).into_iter().zip(std::mem::take(&mut self.observed));
-        (self.faces, self.observed) = all.zip(&stays).filter(|(_, s)| **s).map(|(both, _)| both).unzip();
+        (self.faces, self.observed) = all.zip(stays).filter(|(_, s)| **s).map(|(both, _)| both).unzip();
         self.summary.vertices_split += split_fans(&mut self.vertices, &mut self.faces);
+    }
+
+    /// Marks the faces for which `is_filled` holds as not observed.
+    pub fn mark_filled(&mut self, is_filled: impl Fn(&[Vec3; 3]) -> bool) {
+        for (face, seen) in self.faces.iter().zip(&mut self.observed) {
+            *seen &= !is_filled(&face.map(|v| self.vertices[v as usize]));
+        }
     }
 
     /// The mesh.

@@ -10,8 +10,9 @@
 //! squares, D. Levin, "The approximation power of moving least-squares", Math. Comp. 67, 1998,
 //! doi:10.1090/S0025-5718-98-00974-0), and evaluated at the cluster's centroid. Cells without points but within
 //! `max_gap_m` of one belong to the observed surface; narrower gaps than `fill_hole_m` (a morphological closing) are
-//! filled and marked as such; both get their depth from a thin plate through the neighbours. Four neighbouring cells make
-//! two triangles.
+//! filled and marked as such; both get their depth from a thin plate through the neighbours. Over a side opening that is to be
+//! closed, lines along the tunnel run straight from the wall before it to the wall after it. Four neighbouring cells make two
+//! triangles.
 //!
 //! | symbol | meaning |
 //! |---|---|
@@ -27,9 +28,11 @@ use super::{Mesh, VertexId};
 use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::{Mat3, Vec3, statistics};
 use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint, squared_distance};
-use crate::segment::{Class, Segmentation};
+use crate::segment::{Class, SectionField, Segmentation};
 use rayon::prelude::*;
 use serde::Serialize;
+use std::f64::consts::TAU;
+use std::ops::Range;
 
 /// Default spacing in units of the distance between points: about 1.5 points a cell.
 const SPACING_IN_POINT_DISTANCES: f64 = 1.2;
@@ -53,6 +56,11 @@ const BUMP_POINTS: u32 = 2;
 const BUMP_IN_SCALES: f64 = 5.0;
 /// A face between cells without points is observed when they are within this share of `max_gap_m` of one.
 const NEAR_SHARE: f64 = 0.6;
+/// The wall beside an opening is looked for over this many mean radii, and so many cells away from the rim, which may be a cheek.
+const WALL_IN_RADII: f64 = 0.25;
+const RIM_CELLS: usize = 2;
+/// Sweeps that take the steps from a continued wall.
+const SMOOTHING_SWEEPS: usize = 6;
 /// Sweeps of the thin-plate fill; gaps of ten cells are smooth by then.
 const FILL_SWEEPS: usize = 60;
 
@@ -87,9 +95,8 @@ pub struct Summary {
     pub cells_bridged: usize,
     /// Cells in holes narrower than `fill_hole_m` that were filled.
     pub cells_filled: usize,
-    /// Side drifts, niches and rooms that open into the wall (told in [`super::reconstruct::Summary`]).
-    #[serde(skip)]
-    pub openings: Vec<SideOpening>,
+    /// Cells of side openings that were closed.
+    pub cells_closed: usize,
     /// Vertices split because two parts of the surface touched in a point.
     pub vertices_split: usize,
     /// Components smaller than the largest that were dropped.
@@ -110,10 +117,16 @@ enum Node {
     Bridged,
     /// In a small hole.
     Filled,
+    /// In a side opening that is closed.
+    Closed,
 }
 
 /// Builds the surface; see the module's header. `None` when no cell is left.
-pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Options) -> Option<(Mesh, Summary)> {
+pub(super) fn reconstruct(
+    segmentation: &Segmentation,
+    axis: &Axis,
+    options: &Options,
+) -> Option<(Mesh, Summary, WallLine)> {
     let section = &segmentation.section;
     let (grid, along_gap) = choose_grid(segmentation, options);
     let used = segmentation.coordinates.par_iter().zip(&segmentation.class);
@@ -132,22 +145,20 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
     let clusters = drop_bumps(&grid, clusters, &places, &mut summary);
     let depth: Vec<f64> =
         clusters.iter().zip(&places).map(|(c, p)| if c.count > 0 { p.depth } else { f64::NAN }).collect();
-    let (open, openings) = openings::find(&grid, segmentation, axis, &depth);
-    summary.openings = openings;
-    let clusters = cut_openings(&grid, clusters, &mut places, &open, options.side_openings);
+    let line = WallLine::of(grid, depth, segmentation, axis);
+    let (grid, open) = (&line.grid, &line.open);
+    let clusters = cut_openings(&line, section, clusters, &mut places, options.side_openings);
     let mut furniture = vec![false; grid.len()];
     for (c, _) in segmentation.coordinates.iter().zip(&segmentation.class).filter(|(_, k)| **k == Class::Furniture) {
-        let p = grid.unroll(section, c);
-        if p.row >= 0.0 && p.row < grid.rows as f64 {
-            furniture[p.row as usize * grid.columns + (p.column as usize).min(grid.columns - 1)] = true;
+        if let Some(cell) = grid.cell_at(&grid.unroll(section, c)) {
+            furniture[cell] = true;
         }
     }
-    let state = support(&grid, &clusters, &places, [&furniture, &open], along_gap, options, &mut summary);
-    fill_depths(&grid, &state, &mut places);
+    let state = support(grid, &clusters, &places, [&furniture, open], along_gap, options, &mut summary);
+    fill_depths(grid, &state, &mut places);
     // Between profiles whole rows have no points of their own; elsewhere a face needs a measured corner.
     let profiles = segmentation.sampling.is_profiles();
-    let (mut vertices, faces, observed) =
-        triangulate(&grid, &state, &places, profiles, |p| grid.lift(section, axis, p));
+    let (mut vertices, faces, observed) = triangulate(grid, &state, &places, profiles, |p| grid.lift(section, axis, p));
     let (mut faces, observed) = repair::trim_dangling(faces, observed);
     summary.vertices_split = repair::split_fans(&mut vertices, &mut faces);
     let kept = repair::keep_largest(vertices, faces, observed);
@@ -155,7 +166,7 @@ pub(super) fn reconstruct(segmentation: &Segmentation, axis: &Axis, options: &Op
     summary.faces_dropped = kept.faces_dropped;
     let mesh = Mesh::new(kept.vertices, kept.faces, kept.observed)
         .expect("a triangulated grid with split fans is an oriented manifold");
-    (!mesh.faces().is_empty()).then_some((mesh, summary))
+    (!mesh.faces().is_empty()).then_some((mesh, summary, line))
 }
 
 /// The grid and the reach of a point along the axis.
@@ -269,7 +280,7 @@ fn fit_places(grid: &Grid, cells: &CellPoints, clusters: &[Cluster]) -> Vec<Grid
             let (i, j) = ((cell / grid.columns) as f64 + 0.5, (cell % grid.columns) as f64 + 0.5);
             let cluster = clusters[cell];
             if cluster.count == 0 {
-                return GridPoint { row: i, column: j, depth: 0.0 };
+                return grid.middle(cell, 0.0);
             }
             let (mut row, mut column) = (0.0, 0.0);
             for p in cells.in_cell(cell).iter().filter(|p| p.depth >= cluster.low && p.depth <= cluster.high) {
@@ -375,25 +386,86 @@ fn drop_bumps(grid: &Grid, clusters: Vec<Cluster>, places: &[GridPoint], summary
     kept
 }
 
-/// Where the wall line is, for surfaces that come from another method.
+/// Where the wall opens into side spaces, and where it would go on.
 pub(super) struct WallLine {
     grid: Grid,
+    /// Depth of the surface in each cell, metres behind the mean section, NaN without one.
+    depth: Vec<f64>,
     open: Vec<bool>,
     behind_m: f64,
     pub openings: Vec<SideOpening>,
 }
 
 impl WallLine {
-    /// Whether a place lies in a side opening or behind it.
-    pub fn is_open(&self, c: &AxisCoordinates, segmentation: &Segmentation) -> bool {
-        let p = self.grid.unroll(&segmentation.section, c);
-        if p.row < 0.0 || p.row >= self.grid.rows as f64 {
-            return false;
-        }
-        let cell = p.row as usize * self.grid.columns + (p.column as usize).min(self.grid.columns - 1);
-        // The cheeks of a side drift lie over the cells of its rim.
-        self.open[cell] || (p.depth > self.behind_m && self.grid.neighbours(cell, 2).any(|n| self.open[n]))
+    fn of(grid: Grid, depth: Vec<f64>, segmentation: &Segmentation, axis: &Axis) -> Self {
+        let (open, openings) = openings::find(&grid, segmentation, axis, &depth);
+        Self { behind_m: openings::behind_m(&segmentation.section), grid, depth, open, openings }
     }
+
+    /// Whether a place lies in a side opening or behind it.
+    pub fn is_open(&self, c: &AxisCoordinates, section: &SectionField) -> bool {
+        let p = self.grid.unroll(section, c);
+        // The cheeks of a side drift lie over the cells of its rim.
+        self.grid.cell_at(&p).is_some_and(|cell| {
+            self.open[cell] || (p.depth > self.behind_m && self.grid.neighbours(cell, 2).any(|n| self.open[n]))
+        })
+    }
+
+    /// The wall as if there were no openings: a place in each of their cells.
+    pub fn continued(&self, section: &SectionField) -> Vec<AxisCoordinates> {
+        let depth = continue_wall(&self.grid, section, &self.depth, &self.open);
+        let open = (0..self.grid.len()).filter(|&c| self.open[c]);
+        open.map(|c| self.grid.place(section, &self.grid.middle(c, depth[c]))).collect()
+    }
+}
+
+/// Depth in each cell with the wall continued over the `open` ones: a line along the tunnel runs straight from the wall before an
+/// opening to the wall after it, so that the foot of the wall and the shoulder of the roof go on; where there is only one of
+/// both it goes on straight, and without any the wall lies on the mean section.
+fn continue_wall(grid: &Grid, section: &SectionField, depth: &[f64], open: &[bool]) -> Vec<f64> {
+    // Radii and not depths: what was seen of a side drift may dent the mean section at its mouth.
+    let mean_radius = |cell: usize| grid.place(section, &grid.middle(cell, 0.0)).radius();
+    let window = (WALL_IN_RADII * section.mean_perimeter() / TAU / grid.row_m).ceil() as usize;
+    let wall = |rows: Range<usize>, column: usize| {
+        let cells = rows.map(|i| i * grid.columns + column).filter(|&c| !open[c] && !depth[c].is_nan());
+        statistics::median(&mut cells.map(|c| mean_radius(c) + depth[c]).collect::<Vec<_>>())
+    };
+    let mut continued = depth.to_vec();
+    for column in 0..grid.columns {
+        let is_open = |row: usize| open[row * grid.columns + column];
+        let mut row = 0;
+        while row < grid.rows {
+            let first = row;
+            while row < grid.rows && is_open(row) {
+                row += 1;
+            }
+            if row == first {
+                row += 1;
+                continue;
+            }
+            let before = wall(first.saturating_sub(RIM_CELLS + window)..first.saturating_sub(RIM_CELLS), column);
+            let after = wall(row + RIM_CELLS..(row + RIM_CELLS + window).min(grid.rows), column);
+            for i in first..row {
+                let (cell, share) = (i * grid.columns + column, (i + 1 - first) as f64 / (row + 1 - first) as f64);
+                continued[cell] = match (before, after) {
+                    (Some(before), Some(after)) => before + (after - before) * share - mean_radius(cell),
+                    (Some(radius), None) | (None, Some(radius)) => radius - mean_radius(cell),
+                    (None, None) => 0.0,
+                };
+            }
+        }
+    }
+    let opened: Vec<usize> = (0..grid.len()).filter(|&c| open[c]).collect();
+    for _ in 0..SMOOTHING_SWEEPS {
+        for &cell in &opened {
+            let around = grid.neighbours(cell, 1).filter(|&n| !continued[n].is_nan());
+            let (sum, count) = around.fold((0.0, 0.0), |(s, n), c| (s + continued[c], n + 1.0));
+            if count > 0.0 {
+                continued[cell] = sum / count;
+            }
+        }
+    }
+    continued
 }
 
 /// Finds the side openings without building the surface.
@@ -405,24 +477,26 @@ pub(super) fn wall_line(segmentation: &Segmentation, axis: &Axis, options: &Opti
         CellPoints::sort(&grid, used.map(|(c, class)| class.is_surface().then(|| grid.unroll(section, c))));
     let clusters = choose_clusters(&grid, &cells, &mut Summary::default());
     let depth: Vec<f64> = clusters.iter().map(|c| if c.count > 0 { c.middle } else { f64::NAN }).collect();
-    let (open, openings) = openings::find(&grid, segmentation, axis, &depth);
-    WallLine { behind_m: openings::behind_m(section), grid, open, openings }
+    WallLine::of(grid, depth, segmentation, axis)
 }
 
-/// Empties the cells of side openings, unless these are to be kept.
+/// Empties the cells of side openings, unless these are to be kept; their places are those of the wall line where it is to be continued.
 fn cut_openings(
-    grid: &Grid,
+    line: &WallLine,
+    section: &SectionField,
     mut clusters: Vec<Cluster>,
     places: &mut [GridPoint],
-    open: &[bool],
     what: SideOpenings,
 ) -> Vec<Cluster> {
-    if what != SideOpenings::Keep {
-        for cell in (0..grid.len()).filter(|&c| open[c]) {
-            clusters[cell] = Cluster::default();
-            let (i, j) = ((cell / grid.columns) as f64 + 0.5, (cell % grid.columns) as f64 + 0.5);
-            places[cell] = GridPoint { row: i, column: j, depth: 0.0 };
-        }
+    let (grid, open) = (&line.grid, &line.open);
+    let depth = match what {
+        SideOpenings::Keep => return clusters,
+        SideOpenings::Hole => vec![0.0; grid.len()],
+        SideOpenings::Close => continue_wall(grid, section, &line.depth, open),
+    };
+    for cell in (0..grid.len()).filter(|&c| open[c]) {
+        clusters[cell] = Cluster::default();
+        places[cell] = grid.middle(cell, depth[cell]);
     }
     clusters
 }
@@ -502,12 +576,18 @@ fn support(
         let near = |n: usize| from_furniture[n] <= reach * reach;
         close(grid, &mut state, options.fill_behind_furniture_m / 2.0, scale, near);
     }
-    // The rim of an opening is the wall line: no bridge leads into it.
-    if options.side_openings == SideOpenings::Hole {
-        state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = Node::Absent);
+    // The rim of an opening is the wall line: no bridge leads into it, and nothing in it counts as seen.
+    let inside = match options.side_openings {
+        SideOpenings::Hole => Some(Node::Absent),
+        SideOpenings::Close => Some(Node::Closed),
+        SideOpenings::Keep => None,
+    };
+    if let Some(inside) = inside {
+        state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = inside);
     }
     summary.cells_bridged = state.iter().filter(|s| matches!(s, Node::Near | Node::Bridged)).count();
     summary.cells_filled = state.iter().filter(|s| **s == Node::Filled).count();
+    summary.cells_closed = state.iter().filter(|s| **s == Node::Closed).count();
     state
 }
 
@@ -534,7 +614,8 @@ fn fill_depths(grid: &Grid, state: &[Node], places: &mut [GridPoint]) {
     const UNKNOWN: u32 = u32::MAX;
     let columns = grid.columns;
     // Round in which a node got its first value.
-    let mut known: Vec<u32> = state.iter().map(|s| if *s == Node::Measured { 0 } else { UNKNOWN }).collect();
+    let has_depth = |s: Node| matches!(s, Node::Measured | Node::Closed);
+    let mut known: Vec<u32> = state.iter().map(|s| if has_depth(*s) { 0 } else { UNKNOWN }).collect();
     let mut front: Vec<usize> =
         (0..grid.len()).filter(|&n| matches!(state[n], Node::Near | Node::Bridged | Node::Filled)).collect();
     let unknown = front.clone();
@@ -647,7 +728,7 @@ fn triangulate(
                 ];
                 let mut add = |corners: [usize; 3]| {
                     if corners.iter().all(|&n| id[n] != VertexId::MAX) {
-                        let filled = corners.iter().any(|&n| state[n] == Node::Filled);
+                        let filled = corners.iter().any(|&n| matches!(state[n], Node::Filled | Node::Closed));
                         let measured = corners.iter().any(|&n| state[n] == Node::Measured);
                         let near = corners.iter().all(|&n| state[n] == Node::Near);
                         out.push((corners.map(|n| id[n]), !filled && (measured || near || profiles)));
@@ -728,7 +809,8 @@ mod tests {
     fn mesh_of(points: &[Vec3], options: &Options) -> (Mesh, Summary) {
         let axis = straight();
         let (segmentation, _) = classify_positions(points, &axis, &segment::Settings::default()).unwrap();
-        reconstruct(&segmentation, &axis, options).unwrap()
+        let (mesh, summary, _) = reconstruct(&segmentation, &axis, options).unwrap();
+        (mesh, summary)
     }
 
     fn loops(mesh: &Mesh) -> usize {

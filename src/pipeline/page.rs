@@ -64,6 +64,7 @@ pub(super) fn page(report: &Value, folder: &Path, axis_csv: &str) -> String {
     html.push_str(overview);
     limits(&mut html, report, folder);
     facts(&mut html, report);
+    borders(&mut html, report);
     html.push_str("<h2>Where the map is good</h2>\n");
     html.push_str(coverage);
     html.push_str(distortion);
@@ -158,6 +159,40 @@ fn facts(html: &mut String, report: &Value) {
         if let Some(value) = report.pointer(path).and_then(Value::as_f64) {
             let _ = writeln!(html, "<tr><td>{name}</td><td>{} {unit}</td></tr>", number(value));
         }
+    }
+    html.push_str("</table></div>\n");
+}
+
+/// Where the surface ends, and why: portals, side openings, scan shadows.
+fn borders(html: &mut String, report: &Value) {
+    let Some(borders) = report.pointer("/mesh/borders") else { return };
+    let count = |key: &str| borders.get(key).and_then(Value::as_u64).unwrap_or(0);
+    let _ = writeln!(
+        html,
+        "<h2>Where the surface ends</h2>\n<p>{} of {} expected borders around the axis (portals, or ends of the scan), {} open \
+         edge(s), {} side opening(s), {} hole(s). The longest borders:</p>\n<div class=\"scroll\"><table><tr><th>Border</th>\
+         <th>Chainage</th><th>Side</th><th>Along</th><th>Around</th><th>Length</th></tr>",
+        count("portals"),
+        count("portals_expected"),
+        count("open_edges"),
+        count("side_openings"),
+        count("holes")
+    );
+    for border in borders.get("longest").and_then(Value::as_array).into_iter().flatten() {
+        let metres = |pointer: &str| {
+            let value = border.pointer(pointer).and_then(Value::as_f64).unwrap_or(0.0);
+            format!("<td>{} m</td>", number((value * 100.0).round() / 100.0))
+        };
+        let _ = writeln!(
+            html,
+            "<tr><td>{}</td>{}<td>{}</td>{}{}{}</tr>",
+            escape(&text_of(border, "kind").replace('-', " ")),
+            metres("/chainage_m"),
+            escape(text_of(border, "side")),
+            metres("/width_m/0"),
+            metres("/width_m/1"),
+            metres("/length_m")
+        );
     }
     html.push_str("</table></div>\n");
 }
@@ -475,10 +510,18 @@ mod tests {
                 "histograms": [{ "name": "stretch", "unit": "%", "from": 0.0, "width": 1.0, "percent": [60.0, 40.0] }],
                 "sections": [{ "chainage_m": 5.0, "mean_radii_m": [1.0, 1.0, 1.0], "radii_m": [1.0, null, 1.0] }],
             },
+            "mesh": { "borders": {
+                "portals": 1, "portals_expected": 2, "open_edges": 0, "side_openings": 1, "holes": 3,
+                "longest": [{ "kind": "side-opening", "side": "right", "chainage_m": 8.004, "width_m": [2.5, 2.6], "length_m": 9.1 }],
+            } },
         });
         let csv = "chainage_m,x,y,z,azimuth_deg,gradient_percent\n0,0,0,0,90,0\n1,1,0,0.1,90,10\n";
         let html = page(&report, folder.path(), csv);
         assert!(html.contains("FAIL") && html.contains("7 faces &amp; more") && html.contains("&lt;drift&gt;.laz"));
+        assert!(
+            html.contains("1 of 2 expected borders")
+                && html.contains("<td>side opening</td><td>8 m</td><td>right</td>")
+        );
         assert!(html.contains("<polygon") && html.contains("aria-label=\"plan\""));
         assert!(!html.contains("http") && !html.contains("<script"), "the page must not need anybody else");
     }

@@ -103,11 +103,20 @@ struct StageSection {
     version: u32,
 }
 
+/// What the section of the mesh has besides.
+#[derive(JsonSchema)]
+#[allow(dead_code, reason = "only its schema is used: the section is what the stage tells")]
+struct MeshSection {
+    /// The borders of the surface by what they are.
+    borders: crate::mesh::Borders,
+}
+
 /// JSON Schema of `report.json` (`docs/report.schema.json`).
 pub fn schema() -> Value {
     let mut generator = schemars::SchemaGenerator::default();
     let section = generator.subschema_for::<StageSection>().to_value();
     let profile = generator.subschema_for::<super::profile::Profile>().to_value();
+    let mesh = generator.subschema_for::<MeshSection>().to_value();
     let mut schema = generator.into_root_schema_for::<Report>().to_value();
     schema["title"] = json!("report.json of adit");
     let required = ["ingest", "axis", "mesh", "cut", "unwrap", "map", "profile"];
@@ -115,6 +124,7 @@ pub fn schema() -> Value {
     for stage in all {
         schema["properties"][stage] = match stage {
             "profile" => json!({ "allOf": [section, profile] }),
+            "mesh" => json!({ "allOf": [section, mesh] }),
             _ => section.clone(),
         };
     }
@@ -265,7 +275,13 @@ pub fn summary_lines(report: &Value) -> Vec<String> {
         line("tunnel", format!("{length:.1} m, chainage {start:.2} to {end:.2}{perimeter}"));
     }
     if let (Some(faces), Some(area)) = (at("/mesh/faces"), at("/mesh/area_m2")) {
-        line("surface", format!("{} triangles, {area:.1} m2", count(faces)));
+        let borders = |key: &str| at(&format!("/mesh/borders/{key}")).unwrap_or(0.0) as u64;
+        let ends = ["portals", "open_edges", "side_openings", "holes"]
+            .map(|key| (borders(key), key.replace('_', " ")))
+            .into_iter()
+            .filter(|(n, _)| *n > 0)
+            .map(|(n, what)| format!(", {what} {n}"));
+        line("surface", format!("{} triangles, {area:.1} m2{}", count(faces), ends.collect::<String>()));
     }
     if let Some(mean) = at("/unwrap/stretch/mean") {
         let p95 = at("/unwrap/stretch/p95").unwrap_or(f64::NAN);

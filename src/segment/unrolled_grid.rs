@@ -79,14 +79,30 @@ impl Grid {
         }
     }
 
-    /// The local position of a place on the grid: the inverse of [`Self::unroll`].
-    pub fn lift(&self, section: &SectionField, axis: &Axis, p: &GridPoint) -> Vec3 {
+    /// The middle of a cell, at a depth.
+    pub fn middle(&self, cell: usize, depth: f64) -> GridPoint {
+        GridPoint { row: (cell / self.columns) as f64 + 0.5, column: (cell % self.columns) as f64 + 0.5, depth }
+    }
+
+    /// The cell that a place lies in; `None` before the first row and after the last.
+    pub fn cell_at(&self, p: &GridPoint) -> Option<usize> {
+        let inside = p.row >= 0.0 && p.row < self.rows as f64;
+        inside.then(|| p.row as usize * self.columns + (p.column as usize).min(self.columns - 1))
+    }
+
+    /// The axis coordinates of a place on the grid: the inverse of [`Self::unroll`].
+    pub fn place(&self, section: &SectionField, p: &GridPoint) -> AxisCoordinates {
         let chainage = self.start + p.row * self.row_m;
         let (left, right) = section.girth_range(chainage);
         let angle = section.angle_of_girth(chainage, left + (right - left) * p.column / self.columns as f64);
         // A depth beyond the axis itself would come out on the other side.
         let radius = section.radius(chainage, angle);
-        axis.point_at(&AxisCoordinates::from_polar(chainage, angle, (radius + p.depth).max(1e-3 * radius)))
+        AxisCoordinates::from_polar(chainage, angle, (radius + p.depth).max(1e-3 * radius))
+    }
+
+    /// The local position of a place on the grid.
+    pub fn lift(&self, section: &SectionField, axis: &Axis, p: &GridPoint) -> Vec3 {
+        axis.point_at(&self.place(section, p))
     }
 }
 

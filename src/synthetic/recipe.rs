@@ -3,6 +3,7 @@
 use super::alignment::{Alignment, Stretch};
 use super::furniture::Item;
 use super::lettering::Wall;
+use super::recess::Recess;
 use super::scanner::{Error, ScanPlan};
 use super::section::Section;
 use super::tunnel::Tunnel;
@@ -14,6 +15,12 @@ const CLEARANCE_M: f64 = 0.16;
 
 /// Radius of the ventilation duct, metres.
 const DUCT_RADIUS_M: f64 = 0.24;
+
+/// Mouth of a crosscut, along the tunnel and up, and its depth behind the wall, metres.
+const CROSSCUT_M: [f64; 3] = [2.5, 2.5, 6.0];
+
+/// The same of a niche.
+const NICHE_M: [f64; 3] = [2.0, 2.0, 1.0];
 
 /// Half the width that a parked vehicle needs, metres.
 const VEHICLE_HALF_WIDTH_M: f64 = 0.8;
@@ -57,7 +64,7 @@ pub enum Course {
     Shaft,
 }
 
-/// What may stand and hang in the tunnel.
+/// What may stand and hang in the tunnel, and be cut into its walls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// A ventilation duct below the roof on the right.
@@ -68,6 +75,10 @@ pub enum Kind {
     Rails,
     /// A parked pick-up on the left.
     Vehicle,
+    /// A side drift through the right wall, 2.5 m wide and high and 6 m deep.
+    Crosscut,
+    /// A recess in the left wall, 2 m wide and high and 1 m deep.
+    Niche,
 }
 
 /// Everything that decides a synthetic scan. The default is the bundled sample.
@@ -242,8 +253,36 @@ impl Recipe {
                 let right = -(width / 2.0 - VEHICLE_HALF_WIDTH_M - 0.45);
                 tunnel.furniture.extend(Item::vehicle(0.70 * length, right, floor_up));
             }
+            Kind::Crosscut => tunnel.recesses.push(Recess::crosscut(
+                self.mouth(tunnel, "a crosscut", 0.62, CROSSCUT_M)?,
+                [CROSSCUT_M[0], CROSSCUT_M[1]],
+                width / 2.0 + CROSSCUT_M[2],
+            )),
+            Kind::Niche => tunnel.recesses.push(Recess::niche(
+                self.mouth(tunnel, "a niche", 0.40, NICHE_M)?,
+                [NICHE_M[0], NICHE_M[1]],
+                width / 2.0 + NICHE_M[2],
+            )),
         }
         Ok(())
+    }
+
+    /// Lowest (chainage, up) of a mouth of this size whose middle lies at a share of the length, on the floor if it is flat.
+    fn mouth(
+        &self,
+        tunnel: &Tunnel,
+        what: &'static str,
+        share: f64,
+        [along, high, _]: [f64; 3],
+    ) -> Result<[f64; 2], Error> {
+        let (_, height) = self.size();
+        room(
+            what,
+            height > 1.2 * high && tunnel.length() > 4.0 * along,
+            "a section of at least 3 m and 10 m of length",
+        )?;
+        let floor = tunnel.section.floor_girth().map(|_| tunnel.section.invert_up());
+        Ok([share * tunnel.length() - along / 2.0, floor.unwrap_or(-high / 2.0)])
     }
 }
 

@@ -4,7 +4,7 @@
 //! as the scanner's regular angular grid would put there (cos(incidence) / range^2), spread evenly, and a point is kept
 //! when nothing stands between it and the station. The points of a station come in scan-line order.
 
-use super::furniture::Sheet;
+use super::furniture::{Item, Sheet};
 use super::tunnel::Tunnel;
 use super::view::View;
 use crate::cloud::{self, Attributes, Cloud, Label, ScanFrame, SourceFile, Station};
@@ -35,6 +35,9 @@ const GRAZING_TESTS_M: [f64; 4] = [0.06, 0.15, 0.3, 0.6];
 /// Steeper lines of sight (cosine of incidence above this) are not hidden by the relief they end on.
 const GRAZING_COSINE: f64 = 0.7;
 
+/// The mouth of a recess is met within this share of a line of sight.
+const MOUTH_STEP: f64 = 1e-4;
+
 /// Half the width of the beam, metres: a line of sight that grazes a bump by less still gives an echo.
 const BEAM_M: f64 = 0.004;
 
@@ -50,6 +53,8 @@ pub enum Surface {
     Floor,
     /// Ducts, cables, rails, vehicles.
     Furniture,
+    /// A side drift.
+    Outside,
     /// Nothing: an outlier.
     Outlier,
 }
@@ -112,7 +117,7 @@ pub struct Truth {
     pub surface: Vec<Surface>,
     /// True chainage, metres; NaN for outliers.
     pub chainage_m: Vec<f64>,
-    /// True girth from the crown, metres; NaN for furniture and outliers.
+    /// True girth from the crown, metres; NaN for what is not the swept section: furniture, recesses, outliers.
     pub girth_m: Vec<f64>,
     /// The fracture, 0 for none.
     pub label: Vec<Label>,
@@ -173,9 +178,17 @@ struct Hit {
     in_section: [f64; 3],
 }
 
-/// A rectangular piece of surface, divided into cells: the tunnel itself (chainage, girth) or a piece of furniture.
+/// What a target is a piece of.
+enum Piece {
+    /// The tunnel itself, in (chainage, girth).
+    Tunnel,
+    Furniture(Sheet),
+    Recess(Sheet),
+}
+
+/// A rectangular piece of surface, divided into cells.
 struct Target {
-    sheet: Option<Sheet>,
+    piece: Piece,
     corner: [f64; 2],
     cell_size: [f64; 2],
     cells: [usize; 2],
@@ -183,10 +196,10 @@ struct Target {
 }
 
 impl Target {
-    fn new(sheet: Option<Sheet>, corner: [f64; 2], size: [f64; 2], first_cell: usize) -> Self {
+    fn new(piece: Piece, corner: [f64; 2], size: [f64; 2], first_cell: usize) -> Self {
         let cells = size.map(|m| (m / CELL_M).ceil().max(1.0) as usize);
         let cell_size = [size[0] / cells[0] as f64, size[1] / cells[1] as f64];
-        Self { sheet, corner, cell_size, cells, first_cell }
+        Self { piece, corner, cell_size, cells, first_cell }
     }
 
     fn count(&self) -> usize {
@@ -200,6 +213,15 @@ impl Target {
     }
 }
 
+impl Piece {
+    fn sheet(&self) -> Option<&Sheet> {
+        match self {
+            Self::Tunnel => None,
+            Self::Furniture(sheet) | Self::Recess(sheet) => Some(sheet),
+        }
+    }
+}
+
 /// A cell as one station sees it.
 struct Deal {
     station: usize,
@@ -207,7 +229,7 @@ struct Deal {
     cell: usize,
     /// Points to draw before visibility.
     draws: usize,
-    /// Some probe was hidden by the bend: each point has to be tested.
+    /// Some probe was hidden by rock: each point has to be tested.
     bend_hides: bool,
 }
 
@@ -228,13 +250,13 @@ pub fn scan(tunnel: &Tunnel, plan: &ScanPlan) -> Result<SyntheticScan, Error> {
     let stations_in_section = stations(tunnel, plan);
     let stations = stations_in_section.iter().map(|s| local_point(tunnel, s)).collect();
     let size = [tunnel.length(), tunnel.section.perimeter()];
-    let mut targets = vec![Target::new(None, [0.0, -tunnel.section.half_perimeter()], size, 0)];
-    for (k, item) in tunnel.furniture.iter().enumerate() {
-        for sheet in item.sheets(k) {
-            let first = targets.last().map_or(0, |t| t.first_cell + t.count());
-            let size = sheet.size;
-            targets.push(Target::new(Some(sheet), [0.0, 0.0], size, first));
-        }
+    let mut targets = vec![Target::new(Piece::Tunnel, [0.0, -tunnel.section.half_perimeter()], size, 0)];
+    let furniture = tunnel.furniture.iter().enumerate().flat_map(|(k, item)| item.sheets(k)).map(Piece::Furniture);
+    let recesses = tunnel.recesses.iter().enumerate().flat_map(|(k, r)| r.hollow.sheets(k)).map(Piece::Recess);
+    for piece in furniture.chain(recesses) {
+        let first = targets.last().map_or(0, |t| t.first_cell + t.count());
+        let size = piece.sheet().map_or([0.0; 2], |s| s.size);
+        targets.push(Target::new(piece, [0.0, 0.0], size, first));
     }
     let scanner = Scanner { tunnel, plan, stations, stations_in_section, targets };
     let deals = scanner.deal();
@@ -337,7 +359,7 @@ impl Scanner<'_> {
                     continue;
                 }
                 weight += density;
-                if !self.bend_clear(station, &hit) {
+                if !self.rock_clear(station, target, &hit) {
                     bend_hides = true;
                 } else if self.furniture_clear(station, &hit) && self.relief_clear(station, target, &hit) {
                     visible += 1;
@@ -350,14 +372,19 @@ impl Scanner<'_> {
 
     /// The place of a target that a line of sight may end on.
     fn hit(&self, target: &Target, at: [f64; 2]) -> Hit {
-        let (in_section, normal) = match &target.sheet {
+        let (in_section, normal) = match self.item(target) {
             None => {
                 let outward = self.tunnel.relief_at(at[0], at[1]);
                 let o = self.tunnel.section.point(at[1]);
                 let in_section = [at[0], o.right + o.outward[0] * outward, o.up + o.outward[1] * outward];
                 (in_section, [0.0, -o.outward[0], -o.outward[1]])
             }
-            Some(sheet) => self.tunnel.furniture[sheet.item].place(sheet, at[0], at[1]),
+            Some((item, sheet)) => {
+                let (place, out_of_box) = item.place(sheet, at[0], at[1]);
+                // The walls of a recess are seen from the inside of its box.
+                let inwards = matches!(target.piece, Piece::Recess(_));
+                (place, if inwards { out_of_box.map(|n| -n) } else { out_of_box })
+            }
         };
         let frame = self.tunnel.frame_at(in_section[0]);
         Hit {
@@ -367,13 +394,36 @@ impl Scanner<'_> {
         }
     }
 
+    /// The thing that a target is a sheet of, if it is no piece of the tunnel itself.
+    fn item<'t>(&'t self, target: &'t Target) -> Option<(&'t Item, &'t Sheet)> {
+        match &target.piece {
+            Piece::Tunnel => None,
+            Piece::Furniture(sheet) => Some((&self.tunnel.furniture[sheet.item], sheet)),
+            Piece::Recess(sheet) => Some((&self.tunnel.recesses[sheet.item].hollow, sheet)),
+        }
+    }
+
     /// Whether the place belongs to what the scan sees.
     fn is_seen(&self, target: &Target, at: [f64; 2], hit: &Hit) -> bool {
-        // Gaps are patches of the wall; a thing in front of one is missing where the wall behind it would be.
-        let girth = match target.sheet {
-            None => at[1],
-            Some(_) => self.tunnel.section.foot(hit.in_section[1], hit.in_section[2]).girth,
+        let [s, right, up] = hit.in_section;
+        let foot = || self.tunnel.section.foot(right, up);
+        let in_the_void = || {
+            let foot = foot();
+            foot.outward < self.tunnel.relief_at(s, foot.girth) + SIGHT_TOLERANCE_M
         };
+        // Where a recess opens there is neither wall nor, in the void of the tunnel, a side of its box.
+        let nothing_there = match target.piece {
+            Piece::Tunnel => {
+                !self.tunnel.is_floor(at[1]) && self.tunnel.recesses.iter().any(|r| r.holds(&hit.in_section))
+            }
+            Piece::Recess(_) => in_the_void(),
+            Piece::Furniture(_) => false,
+        };
+        if nothing_there {
+            return false;
+        }
+        // Gaps are patches of the wall; a thing in front of one is missing where the wall behind it would be.
+        let girth = if let Piece::Tunnel = target.piece { at[1] } else { foot().girth };
         let crown_up = self.tunnel.section.point(0.0).up;
         self.plan.view.sees(&hit.in_section, girth, crown_up, self.plan.seed)
     }
@@ -389,6 +439,19 @@ impl Scanner<'_> {
             return 0.0;
         }
         cos_incidence / range.max(self.plan.saturation_range_m).powi(2)
+    }
+
+    /// Whether no rock is in the way before the last stretch: into a recess the line of sight leads through its mouth.
+    fn rock_clear(&self, station: usize, target: &Target, hit: &Hit) -> bool {
+        let Piece::Recess(sheet) = &target.piece else { return self.bend_clear(station, hit) };
+        // The line leaves a convex section once; there it must be in the box, which is convex too.
+        let (mut inside, mut outside) = (0.0, 1.0);
+        while outside - inside > MOUTH_STEP {
+            let middle = (inside + outside) / 2.0;
+            let [_, right, up] = self.on_sight(station, hit, middle);
+            if self.tunnel.section.foot(right, up).outward < 0.0 { inside = middle } else { outside = middle }
+        }
+        self.tunnel.recesses[sheet.item].holds(&self.on_sight(station, hit, outside))
     }
 
     /// Whether the line of sight stays in the void; only a bend can hide the wall of a convex section. The last stretch
@@ -442,7 +505,7 @@ impl Scanner<'_> {
 
     /// Whether a grazing line of sight passes the bumps just before the wall.
     fn relief_clear(&self, station: usize, target: &Target, hit: &Hit) -> bool {
-        if self.tunnel.relief.is_none() || target.sheet.is_some() {
+        if self.tunnel.relief.is_none() || !matches!(target.piece, Piece::Tunnel) {
             return true;
         }
         let ray = hit.position - self.stations[station];
@@ -469,12 +532,12 @@ impl Scanner<'_> {
             // The R2 sequence: evenly spread for any number of points.
             place = [(place[0] + 0.754_877_666_246_692_8).fract(), (place[1] + 0.569_840_290_998_053_3).fract()];
             let at = target.place(deal.cell, place[0], place[1]);
-            let item = target.sheet.as_ref().map(|s| (&self.tunnel.furniture[s.item], s.axis()));
+            let item = self.item(target).map(|(item, sheet)| (item, sheet.axis()));
             let Some(at) = self.plan.view.on_profile(at, item) else { continue };
             let hit = self.hit(target, at);
             if self.density(deal.station, &hit) == 0.0
                 || !self.is_seen(target, at, &hit)
-                || (deal.bend_hides && !self.bend_clear(deal.station, &hit))
+                || (deal.bend_hides && !self.rock_clear(deal.station, target, &hit))
                 || !self.furniture_clear(deal.station, &hit)
                 || !self.relief_clear(deal.station, target, &hit)
             {
@@ -496,15 +559,19 @@ impl Scanner<'_> {
             let color = [0.4, 0.4, 0.42].map(sixteen_bits);
             return Shot { position, surface: Surface::Outlier, chainage, girth, label: 0, color, intensity: 2_000 };
         }
-        let (position, normal, surface, girth, label, color, reflectance) = match &target.sheet {
+        let (position, normal, surface, girth, label, color, reflectance) = match self.item(target) {
             None => {
                 let w = self.tunnel.wall_at(at[0], at[1]);
                 let surface = if w.is_floor { Surface::Floor } else { Surface::Wall };
                 (w.position, w.normal, surface, at[1], w.label, w.color, w.reflectance)
             }
-            Some(sheet) => {
-                let color = self.tunnel.furniture[sheet.item].color();
-                (hit.position, hit.normal, Surface::Furniture, f64::NAN, 0, color, 0.6)
+            Some((item, sheet)) => {
+                let surface = match &target.piece {
+                    Piece::Recess(_) if self.tunnel.recesses[sheet.item].leads_away => Surface::Outside,
+                    Piece::Recess(_) => Surface::Wall,
+                    _ => Surface::Furniture,
+                };
+                (hit.position, hit.normal, surface, f64::NAN, 0, item.color(), 0.6)
             }
         };
         let ray = position - from;
@@ -589,7 +656,7 @@ fn assemble(plan: &ScanPlan, stations: &[Vec3], shots: Vec<(usize, Vec<Shot>)>) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::{Alignment, Item, Section, SectionPoint};
+    use crate::synthetic::{Alignment, Item, Recess, Section, SectionPoint};
 
     fn quiet(points: usize) -> ScanPlan {
         ScanPlan { points, range_noise_m: 0.0, ..ScanPlan::default() }
@@ -607,6 +674,39 @@ mod tests {
                 assert!((p - tunnel.point_at(&q)).norm() < 1e-9);
             }
         }
+    }
+
+    #[test]
+    fn a_crosscut_is_seen_through_its_mouth_only() {
+        let tunnel =
+            |recesses| Tunnel { recesses, ..Tunnel::smooth(Section::horseshoe(4.6, 4.2), Alignment::straight(20.0)) };
+        let plan = ScanPlan { station_chainages_m: vec![4.0], station_offset_m: 0.0, ..quiet(40_000) };
+        let crosscut = Recess::crosscut([9.0, -2.1], [2.5, 2.5], 8.3);
+        let SyntheticScan { cloud, truth } = scan(&tunnel(vec![crosscut.clone()]), &plan).unwrap();
+        let in_section: Vec<[f64; 3]> = cloud.positions().iter().map(|p| [p.x, -p.y, p.z]).collect();
+        let behind = |k: usize| in_section[k][1] > 2.3 + 1e-9;
+        let seen: Vec<usize> = (0..cloud.len()).filter(|&k| behind(k)).collect();
+        assert!(seen.len() > 150, "{}", seen.len());
+        for &k in &seen {
+            assert!(truth.surface[k] == Surface::Outside && truth.girth_m[k].is_nan());
+            // The ray meets the wall at right = 2.3 inside the mouth; the near cheek faces away from the station.
+            let [s, right, up] = in_section[k];
+            let share = 2.3 / right;
+            let (at_s, at_up) = (4.0 + (s - 4.0) * share, -0.5 + (up + 0.5) * share);
+            assert!((9.0..11.5).contains(&at_s) && (-2.1..0.41).contains(&at_up), "{s} {right} {up}");
+            assert!(s > 9.01, "the near cheek");
+        }
+        // Below the springline, where the wall stands at right = 2.3.
+        let in_mouth = |p: &[f64; 3]| (9.01..11.49).contains(&p[0]) && (-2.05..-0.2).contains(&p[2]);
+        let on_the_wall = |p: &[f64; 3]| (p[1] - 2.3).abs() < 1e-6;
+        assert!(!in_section.iter().any(|p| in_mouth(p) && on_the_wall(p)), "wall in the mouth");
+        assert!(
+            in_section.iter().any(|p| (9.0..11.5).contains(&p[0]) && p[1] > 1.0 && p[2] < -2.09),
+            "the floor stays"
+        );
+        let niche = Recess { leads_away: false, ..crosscut };
+        let scan = scan(&tunnel(vec![niche]), &plan).unwrap();
+        assert!(seen.iter().all(|&k| scan.truth.surface[k] == Surface::Wall));
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use super::fracture::Fracture;
 use super::furniture::Item;
 use super::lettering::{Lettering, Wall};
+use super::recess::Recess;
 use super::relief::Relief;
 use super::rock::{Place, Rock, step};
 use super::{Alignment, Section};
@@ -76,6 +77,8 @@ pub struct Tunnel {
     pub rock: Rock,
     /// What stands and hangs in it.
     pub furniture: Vec<Item>,
+    /// What is cut into its walls. The closed form of the surface leaves them out.
+    pub recesses: Vec<Recess>,
 }
 
 impl Tunnel {
@@ -89,6 +92,7 @@ impl Tunnel {
             lettering: Vec::new(),
             rock: Rock::new(1),
             furniture: Vec::new(),
+            recesses: Vec::new(),
         }
     }
 
