@@ -38,6 +38,8 @@ const COURSE_REACH_M: f64 = 7.5;
 const COURSE_STEP_M: f64 = 0.5;
 /// So many robust standard deviations from the usual depth are no relief.
 const UNUSUAL: f64 = 4.0;
+/// Where that is more than this many times [`STAND_OUT_IN_RADII`], no depth is usual: a cave.
+const MOST_UNUSUAL: f64 = 3.0;
 /// What takes more than this share of a section is a narrower tunnel and no thing in it.
 const MOST_OF_A_SECTION: f64 = 0.6;
 /// A bench is at least this long and this wide, metres, and not higher than this share of the tunnel's height.
@@ -102,12 +104,13 @@ pub(super) fn classify(
     let outlines = outlines(grid, &first, &clusters, &patch_of, patches);
     let offsets = offsets_from_main(grid, &clusters, &patch_of, main, patches);
     let benches = benches(grid, section, &clusters, &patch_of, main, patches);
+    let sections = sections(grid, &clusters, &patch_of, patches);
     let mut counts = PatchCounts { patches, ..PatchCounts::default() };
     let class_of_patch: Vec<Class> = (0..patches)
         .map(|p| {
             let (front, total) = outlines[p];
             let offset = offsets[p];
-            if p == main || benches[p] {
+            if p == main || benches[p] || sections[p] {
                 counts.surface_patches += 1;
                 Class::Wall
             } else if points[p] < THING_POINTS {
@@ -246,7 +249,6 @@ fn standing_out(
     let core = STAND_OUT_IN_RADII * mean_radius;
     let usual = usual_along(grid, &far);
     let mut relief: Vec<f64> = far.iter().zip(&usual).map(|(d, u)| (d - u).abs()).filter(|d| d.is_finite()).collect();
-    // In a cave nothing is usual.
     let unusual = core.max(UNUSUAL * 1.4826 * statistics::median(&mut relief).unwrap_or(f64::INFINITY));
     // In front by how many cores.
     let above_ground: Vec<bool> = clusters.par_iter().map(|c| place(c.cell as usize, c.middle) >= ground).collect();
@@ -258,7 +260,10 @@ fn standing_out(
         let fill = closed[clusters[k].cell as usize] - clusters[k].middle;
         if above_ground[k] && fill.is_finite() { fill / core } else { 0.0 }
     });
-    let by_course = measure(&|k| (usual[clusters[k].cell as usize] - clusters[k].middle) / unusual);
+    let is_cave = unusual > MOST_UNUSUAL * core;
+    let by_course = measure(&|k| {
+        if is_cave { 0.0 } else { (usual[clusters[k].cell as usize] - clusters[k].middle) / unusual }
+    });
     let mut out = vec![false; clusters.len()];
     for (in_front, largest_share) in [(by_window, f64::INFINITY), (by_course, MOST_OF_A_SECTION)] {
         let mut seen = vec![false; clusters.len()];
@@ -404,6 +409,19 @@ fn outlines(grid: &Grid, first: &[u32], clusters: &[Cluster], patch_of: &[u32], 
         }
     }
     outline
+}
+
+/// Which patches go around most of the section where they are: the tunnel itself, narrower or wider there.
+fn sections(grid: &Grid, clusters: &[Cluster], patch_of: &[u32], patches: usize) -> Vec<bool> {
+    // Clusters come row by row, cell by cell.
+    let (mut cells, mut rows) = (vec![0usize; patches], vec![0usize; patches]);
+    let (mut last_cell, mut last_row) = (vec![usize::MAX; patches], vec![usize::MAX; patches]);
+    for (c, &p) in clusters.iter().zip(patch_of) {
+        let (p, cell) = (p as usize, c.cell as usize);
+        cells[p] += usize::from(std::mem::replace(&mut last_cell[p], cell) != cell);
+        rows[p] += usize::from(std::mem::replace(&mut last_row[p], cell / grid.columns) != cell / grid.columns);
+    }
+    cells.iter().zip(&rows).map(|(&c, &r)| c as f64 > MOST_OF_A_SECTION * (r * grid.columns) as f64).collect()
 }
 
 /// Which patches are benches: level strips low over the ground that run along the tunnel (walkways, kerbs, ballast
