@@ -96,7 +96,7 @@ fn a_crosscut_is_a_hole_or_closed_with_wall_that_nobody_saw() {
         "{opening}"
     );
     assert!(warning(&report, "side-openings").unwrap().contains("left as holes"));
-    let [u, v] = [shrunk(MOUTH_M, 0.4), shrunk(girths, 0.4)];
+    let [u, v] = [shrunk(MOUTH_M, 0.3), shrunk(girths, 0.3)];
     assert!(pixels_within(&hole, "coverage", u, v).iter().all(|p| p[3] == 0), "a hole");
 
     for method in ["section", "poisson"] {

@@ -22,6 +22,9 @@ const BEHIND_IN_RADII: f64 = 0.1;
 const LEAST_WIDTH_IN_RADII: f64 = 0.25;
 /// An opening leads at least this many mean radii behind the wall line.
 const LEAST_DEPTH_IN_RADII: f64 = 0.4;
+/// Beside an opening cells that lie behind the wall line by this share of that are still its cheeks, so many cells away.
+const CHEEK_SHARE: f64 = 0.3;
+const CHEEK_CELLS: usize = 3;
 /// Share of the points of an opening that lie at its far end, for the end of its axis.
 const FAR_SHARE: f64 = 0.05;
 
@@ -145,7 +148,7 @@ pub(super) fn find(
         // What fills half the section is no opening in a wall; the section itself is not understood there.
         let half_the_section = opening.width_m[1] > 0.6 * section.mean_perimeter();
         if wide && !half_the_section && opening.seen_depth_m >= LEAST_DEPTH_IN_RADII * mean_radius {
-            take(grid, depth, region, &extent, &mut open);
+            take(grid, depth, region, &extent, behind, &mut open);
             found.push(opening);
         }
     }
@@ -183,8 +186,9 @@ impl Extent {
 }
 
 /// Opens the cells of a region, and the empty ones that hang together with them within its extent: a side drift is seen
-/// aslant, and where one looks far into it nothing lies over the middle of its mouth.
-fn take(grid: &Grid, depth: &[f64], region: Vec<usize>, extent: &Extent, open: &mut [bool]) {
+/// aslant, and where one looks far into it nothing lies over the middle of its mouth. What is left of its cheeks around them
+/// goes as well: the rim lies on the wall.
+fn take(grid: &Grid, depth: &[f64], region: Vec<usize>, extent: &Extent, behind_m: f64, open: &mut [bool]) {
     region.iter().for_each(|&c| open[c] = true);
     let mut front = region;
     while let Some(cell) = front.pop() {
@@ -194,6 +198,12 @@ fn take(grid: &Grid, depth: &[f64], region: Vec<usize>, extent: &Extent, open: &
                 front.push(n);
             }
         }
+    }
+    for _ in 0..CHEEK_CELLS {
+        let beside = |c: usize| grid.neighbours(c, 1).any(|n| open[n]);
+        let cheeks: Vec<usize> =
+            (0..grid.len()).filter(|&c| !open[c] && depth[c] > CHEEK_SHARE * behind_m && beside(c)).collect();
+        cheeks.into_iter().for_each(|c| open[c] = true);
     }
 }
 
