@@ -3,8 +3,9 @@
 //! `cargo bench --bench points -- SCAN.laz [--cell 0.05] [--neighbours 16] [--repeat 3] [--normals OUT]`
 //!
 //! Every step is one call of the library on all points of the scan, as read. Wall seconds and CPU seconds (user and
-//! system, all threads; Linux only) are those of the fastest of the repeats. `--normals` writes both normals, in point order, as raw
-//! little-endian f64 triples to OUT.fixed and OUT.adaptive (`points_against_peers.py` measures their error). Without a scan a synthetic drift of a million points is made.
+//! system, all threads; Linux only) are those of the fastest of the repeats. `--normals` writes both normals, in point
+//! order, as raw little-endian f64 triples to OUT.fixed and OUT.adaptive (`points_against_peers.py` measures their error).
+//! Without a scan a synthetic drift of a million points is made.
 #![allow(clippy::print_stdout, reason = "a bench is a program of its own")]
 
 use adit::clean::{StatisticalOutliers, VoxelDownsample, remove_statistical_outliers, voxel_downsample};

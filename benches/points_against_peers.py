@@ -80,7 +80,10 @@ def main():
                 file.write(points.astype("<f4").tobytes())
             leaf = ",".join([str(given.cell)] * 3)
             told = subprocess.run(
-                ["pcl_voxel_grid", pcd, os.path.join(folder, "thin.pcd"), "-leaf", leaf], capture_output=True, text=True
+                ["pcl_voxel_grid", pcd, os.path.join(folder, "thin.pcd"), "-leaf", leaf],
+                check=True,
+                capture_output=True,
+                text=True,
             )
             # Reading, the step, writing: each "[done, MS ms : POINTS points]".
             steps = re.findall(r"\[done, ([\d.e+]+) ms *: (\d+)", re.sub(r"\x1b\[[\d;]*m", "", told.stdout + told.stderr))

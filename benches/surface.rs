@@ -45,8 +45,9 @@ fn main() {
         return;
     };
     let out = match more {
+        [] => None,
         [flag, prefix] if flag == "--mesh" => Some(prefix),
-        _ => None,
+        other => panic!("not understood: {other:?}"),
     };
     let bytes = std::fs::read(file).expect("oriented points");
     let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)).collect();

@@ -66,7 +66,7 @@ pub struct Borders {
     pub side_openings: usize,
     /// Scan shadows and other holes.
     pub holes: usize,
-    /// The longest borders, at most twelve, the longest first.
+    /// The longest borders, at most twelve, the longest first, holes after all others.
     pub longest: Vec<Border>,
 }
 
@@ -105,6 +105,8 @@ impl Borders {
             let rim = order.iter().find(|&&i| kinds[i] == Kind::Hole && outlines[i].share_of(opening) >= RIM_SHARE);
             rim.into_iter().for_each(|&i| kinds[i] = Kind::SideOpening);
         }
+        // The ends of the tunnel are told however many shadows are longer.
+        order.sort_by_key(|&i| kinds[i] == Kind::Hole);
         let count = |kind: Kind| kinds.iter().filter(|k| **k == kind).count();
         Self {
             portals: count(Kind::Portal),

@@ -2,6 +2,7 @@
 
 pub mod reconstruct;
 pub mod openings;
+mod wall_line;
 pub mod borders;
 pub mod section;
 pub mod poisson;

@@ -3,6 +3,7 @@
 use super::borders::{self, Borders};
 use super::decimate::{self, Decimate};
 use super::openings::{self, SideOpening, SideOpenings};
+use super::wall_line::WallLine;
 use super::{FaceId, Mesh, VertexId, poisson, repair, section, topology};
 use crate::axis::{Axis, AxisCoordinates};
 use crate::numeric::Vec3;
@@ -276,7 +277,7 @@ fn by_poisson(
     let mut walls: Vec<Vec3> = classified().filter(|(_, k)| **k != Class::Noise).map(|(c, _)| place(c)).collect();
     if let Some(line) = line.as_ref().filter(|_| closes) {
         // The wall line stands in for what was seen behind it, so that the surface runs on over the mouth.
-        let drawn: Vec<Vec3> = line.continued(&segmentation.section).iter().map(place).collect();
+        let drawn: Vec<Vec3> = line.places_over_openings(&segmentation.section).iter().map(place).collect();
         walls.extend(&drawn);
         points.extend(drawn);
     }
@@ -340,7 +341,7 @@ fn by_poisson(
 /// Area of the surface that closes side openings, square metres; `None` when none was to be closed.
 fn closed_m2(
     mesh: &Mesh,
-    line: &section::WallLine,
+    line: &WallLine,
     axis: &Axis,
     segmentation: &Segmentation,
     settings: &Settings,

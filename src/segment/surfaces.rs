@@ -38,8 +38,6 @@ const COURSE_REACH_M: f64 = 7.5;
 const COURSE_STEP_M: f64 = 0.5;
 /// So many robust standard deviations from the usual depth are no relief.
 const UNUSUAL: f64 = 4.0;
-/// Where that is more than this many times [`STAND_OUT_IN_RADII`], no depth is usual: a cave.
-const MOST_UNUSUAL: f64 = 3.0;
 /// What takes more than this share of a section is a narrower tunnel and no thing in it.
 const MOST_OF_A_SECTION: f64 = 0.6;
 /// A bench is at least this long and this wide, metres, and not higher than this share of the tunnel's height.
@@ -260,10 +258,7 @@ fn standing_out(
         let fill = closed[clusters[k].cell as usize] - clusters[k].middle;
         if above_ground[k] && fill.is_finite() { fill / core } else { 0.0 }
     });
-    let is_cave = unusual > MOST_UNUSUAL * core;
-    let by_course = measure(&|k| {
-        if is_cave { 0.0 } else { (usual[clusters[k].cell as usize] - clusters[k].middle) / unusual }
-    });
+    let by_course = measure(&|k| (usual[clusters[k].cell as usize] - clusters[k].middle) / unusual);
     let mut out = vec![false; clusters.len()];
     for (in_front, largest_share) in [(by_window, f64::INFINITY), (by_course, MOST_OF_A_SECTION)] {
         let mut seen = vec![false; clusters.len()];

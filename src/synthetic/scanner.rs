@@ -230,7 +230,7 @@ struct Deal {
     /// Points to draw before visibility.
     draws: usize,
     /// Some probe was hidden by rock: each point has to be tested.
-    bend_hides: bool,
+    rock_hides: bool,
 }
 
 struct Scanner<'a> {
@@ -322,7 +322,7 @@ impl Scanner<'_> {
         let total: f64 = seen.iter().map(|&(weight, share, _)| weight * share).sum();
         let mut deals = Vec::new();
         let (mut owed, mut given) = (0.0, 0.0);
-        for (id, &(weight, share, bend_hides)) in seen.iter().enumerate() {
+        for (id, &(weight, share, rock_hides)) in seen.iter().enumerate() {
             if weight * share == 0.0 {
                 continue;
             }
@@ -332,7 +332,7 @@ impl Scanner<'_> {
             if draws > 0.0 {
                 let (target, cell) = places[id % places.len()];
                 let station = id / places.len();
-                deals.push(Deal { station, target, cell, draws: draws as usize, bend_hides });
+                deals.push(Deal { station, target, cell, draws: draws as usize, rock_hides });
             }
         }
         deals
@@ -347,7 +347,7 @@ impl Scanner<'_> {
         if (hit.position - self.stations[station]).norm() > self.plan.max_range_m + reach {
             return (0.0, 0.0, false);
         }
-        let (mut weight, mut visible, mut bend_hides) = (0.0, 0, false);
+        let (mut weight, mut visible, mut rock_hides) = (0.0, 0, false);
         for i in 0..PROBES {
             for j in 0..PROBES {
                 let share = |k: usize| (k as f64 + 0.5) / PROBES as f64;
@@ -355,19 +355,19 @@ impl Scanner<'_> {
                 let hit = self.hit(target, at);
                 let density = self.density(station, &hit);
                 if density == 0.0 || !self.is_seen(target, at, &hit) {
-                    bend_hides = true;
+                    rock_hides = true;
                     continue;
                 }
                 weight += density;
                 if !self.rock_clear(station, target, &hit) {
-                    bend_hides = true;
+                    rock_hides = true;
                 } else if self.furniture_clear(station, &hit) && self.relief_clear(station, target, &hit) {
                     visible += 1;
                 }
             }
         }
         let probes = (PROBES * PROBES) as f64;
-        (weight / probes * target.cell_size[0] * target.cell_size[1], f64::from(visible) / probes, bend_hides)
+        (weight / probes * target.cell_size[0] * target.cell_size[1], f64::from(visible) / probes, rock_hides)
     }
 
     /// The place of a target that a line of sight may end on.
@@ -537,7 +537,7 @@ impl Scanner<'_> {
             let hit = self.hit(target, at);
             if self.density(deal.station, &hit) == 0.0
                 || !self.is_seen(target, at, &hit)
-                || (deal.bend_hides && !self.rock_clear(deal.station, target, &hit))
+                || (deal.rock_hides && !self.rock_clear(deal.station, target, &hit))
                 || !self.furniture_clear(deal.station, &hit)
                 || !self.relief_clear(deal.station, target, &hit)
             {
