@@ -4,7 +4,8 @@
 //!
 //! ORIENTED.f64 holds x, y, z and the unit normal into the void of each point as raw little-endian f64. `section` takes no
 //! normals; it needs the axis and the classes of the points, whose seconds are told beside it. OUT_PREFIX.section and
-//! OUT_PREFIX.poisson get the number of vertices and faces (i64), the vertices (f64) and the corners (i32);
+//! OUT_PREFIX.poisson get the number of vertices and faces (i64), the vertices (f64), the corners (i32) and whether each face was
+//! observed (u8);
 //! `surface_against_peers.py` makes the one and measures the others. Wall seconds and CPU seconds (user and system, all
 //! threads; Linux only).
 #![allow(clippy::print_stdout, reason = "a bench is a program of its own")]
@@ -30,11 +31,12 @@ fn timed<T>(name: &str, step: impl FnOnce() -> T) -> T {
     result
 }
 
-fn write(file: &str, vertices: &[Vec3], faces: &[[u32; 3]]) {
+fn write(file: &str, vertices: &[Vec3], faces: &[[u32; 3]], observed: &[bool]) {
     let mut bytes = Vec::new();
     [vertices.len(), faces.len()].iter().for_each(|n| bytes.extend((*n as i64).to_le_bytes()));
     vertices.iter().flat_map(|v| [v.x, v.y, v.z]).for_each(|c| bytes.extend(c.to_le_bytes()));
     faces.iter().flatten().for_each(|&v| bytes.extend((v as i32).to_le_bytes()));
+    bytes.extend(observed.iter().map(|&o| u8::from(o)));
     std::fs::write(file, bytes).expect("the mesh can be written");
 }
 
@@ -62,14 +64,14 @@ fn main() {
     let settings = Settings { method: Method::Section, ..Settings::default() };
     let (mesh, _) = timed("section", || reconstruct(&classes, &axis, &settings)).expect("a surface");
     if let Some(prefix) = out {
-        write(&format!("{prefix}.section"), mesh.vertices(), mesh.faces());
+        write(&format!("{prefix}.section"), mesh.vertices(), mesh.faces(), mesh.observed());
     }
     drop((mesh, classes));
 
-    let (vertices, faces, _, summary) =
+    let (vertices, faces, observed, summary) =
         timed("poisson", || poisson::of_oriented_points(&points, &normals, cell_m, 0.05, 0.3));
     println!("{summary:?}");
     if let Some(prefix) = out {
-        write(&format!("{prefix}.poisson"), &vertices, &faces);
+        write(&format!("{prefix}.poisson"), &vertices, &faces, &observed);
     }
 }

@@ -9,7 +9,8 @@ PEERS_VENV names a Python environment with numpy and open3d (and meshlib); the s
 executable is built by `cargo bench --bench surface --no-run`, which prints its name. Each line tells wall seconds and
 CPU seconds (all threads) of the step alone and, over vertices in use: root mean square distance from the truth, of all and
 of those nearer than 10 cm, the share that is farther away, and the share of the truth's vertices within 2 cm of the mesh;
-then the boundary loops and how far the surface goes at most from the nearest point (middles of faces and vertices).
+then the boundary loops and how far the surface goes at most from the nearest point (middles of faces and vertices), faces that
+Adit marks as filled told apart.
 """
 import argparse
 import os
@@ -60,18 +61,21 @@ def main():
 
     tree = cKDTree(points)
 
-    def tell(name, vertices, faces):
+    def farthest_cm(vertices, faces):
+        places = np.vstack([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        return 100 * tree.query(places, workers=-1)[0].max()
+
+    def tell(name, vertices, faces, observed=None):
         used = vertices[np.unique(faces)]
         d = distances(true_vertices, true_faces, used)
         sample = true_vertices[np.random.default_rng(3).choice(len(true_vertices), 200_000, replace=False)]
         covered = (distances(vertices, faces, sample) < 0.02).mean()
-        places = np.vstack([used, vertices[faces].mean(axis=1)])
-        farthest = tree.query(places, workers=-1)[0].max()
+        seen = "" if observed is None else f", observed at most {farthest_cm(vertices, faces[observed]):.2f}"
         rms = lambda e: 1000 * np.sqrt((e**2).mean())
         print(
             f"{name:<18} {len(faces):8d} faces  rms {rms(d):7.2f} mm, within 10 cm {rms(d[d < 0.1]):5.2f} mm, "
             f"farther {100 * (d >= 0.1).mean():.2f} %, truth covered {100 * covered:.1f} %, {boundary_loops(faces)} boundary "
-            f"loops, at most {100 * farthest:.1f} cm from a point",
+            f"loops, at most {farthest_cm(vertices, faces):.1f} cm from a point{seen}",
             flush=True,
         )
 
@@ -87,7 +91,8 @@ def main():
                 nv, nf = np.fromfile(file, "<i8", 2)
                 vertices = np.fromfile(file, "<f8", 3 * nv).reshape(-1, 3)
                 faces = np.fromfile(file, "<i4", 3 * nf).reshape(-1, 3)
-            tell(f"adit {method}", vertices, faces)
+                observed = np.fromfile(file, "u1", nf) > 0
+            tell(f"adit {method}", vertices, faces, observed)
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)

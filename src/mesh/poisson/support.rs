@@ -18,7 +18,7 @@ pub(in crate::mesh) struct Raw {
 /// At a border, where nothing but the surface's own inertia leads on, faces reach at most this many cells beyond the points.
 const OVERHANG_IN_CELLS: f64 = 0.5;
 
-/// Keeps observed faces, all of whose corners lie within `gap_m` of a point, and unobserved ones that close a hole: connected,
+/// Keeps observed faces, whose corners and middle lie within `gap_m` of a point, and unobserved ones that close a hole: connected,
 /// not on a border, and nowhere farther from a point than half of `fill_hole_m`. Then borders recede to where the points end.
 pub(super) fn trim(net: Net, points: &[Vec3], fill_hole_m: f64, summary: &mut Summary) -> Raw {
     let gap_m = summary.gap_m;
@@ -26,7 +26,14 @@ pub(super) fn trim(net: Net, points: &[Vec3], fill_hole_m: f64, summary: &mut Su
     let tree = KdTree::new(points);
     let far: Vec<f64> =
         vertices.par_iter().map(|v| tree.nearest(v).map_or(f64::INFINITY, |n| n.distance_squared.sqrt())).collect();
-    let observed: Vec<bool> = faces.iter().map(|f| f.iter().all(|&v| far[v as usize] <= gap_m)).collect();
+    let is_observed = |f: &[VertexId; 3]| {
+        let middle = f.iter().map(|&v| vertices[v as usize]).sum::<Vec3>() / 3.0;
+        let at_most = f.iter().map(|&v| (vertices[v as usize] - middle).norm() + far[v as usize]);
+        f.iter().all(|&v| far[v as usize] <= gap_m)
+            && (at_most.fold(f64::INFINITY, f64::min) <= gap_m
+                || tree.nearest(&middle).is_some_and(|n| n.distance_squared <= gap_m * gap_m))
+    };
+    let observed: Vec<bool> = faces.par_iter().map(is_observed).collect();
     // Sheets that touch must not count as borders here, so edges are looked at as they come.
     let (twin, _) = topology::lenient_twins(&faces);
     let mut keep = observed.clone();

@@ -14,8 +14,7 @@ pub(super) fn fill_depths(grid: &Grid, state: &[Node], places: &mut [GridPoint])
     // Round in which a node got its first value.
     let has_depth = |s: Node| matches!(s, Node::Measured | Node::Closed);
     let mut known: Vec<u32> = state.iter().map(|s| if has_depth(*s) { 0 } else { UNKNOWN }).collect();
-    let mut front: Vec<usize> =
-        (0..grid.len()).filter(|&n| matches!(state[n], Node::Near | Node::Bridged | Node::Filled)).collect();
+    let mut front: Vec<usize> = (0..grid.len()).filter(|&n| matches!(state[n], Node::Bridged | Node::Filled)).collect();
     let unknown = front.clone();
     let mut round = 0;
     while !front.is_empty() {

@@ -26,6 +26,7 @@ mod clusters;
 mod fit;
 mod support;
 mod fill_depths;
+mod points_near;
 mod triangulate;
 
 use super::Mesh;
@@ -33,18 +34,23 @@ use super::openings::SideOpenings;
 use super::repair;
 use super::wall_line::WallLine;
 use crate::axis::Axis;
+use crate::numeric::Vec3;
 use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint};
 use crate::segment::{Class, SectionField, Segmentation};
 use clusters::{Cluster, choose_clusters, drop_bumps, drop_isolated};
 use fill_depths::fill_depths;
 use fit::fit_places;
+use points_near::PointsNear;
 use rayon::prelude::*;
 use serde::Serialize;
-use support::support;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use support::{Node, support};
 use triangulate::triangulate;
 
 /// Default spacing in units of the distance between points: about 1.5 points a cell.
 const SPACING_IN_POINT_DISTANCES: f64 = 1.2;
+/// Points farther apart than `max_gap_m` speak for the surface this far around, in cells of the default spacing.
+const SPARSE_REACH: f64 = 1.5;
 /// Default spacing is not finer than this share of the perimeter (4.4 cm in a rail tunnel).
 const FINEST_SHARE_OF_PERIMETER: f64 = 1.0 / 600.0;
 /// Longest side ratio of the cells of a profile scan.
@@ -85,6 +91,8 @@ pub struct Summary {
     pub multiple_depth_percent: f64,
     /// Cells without points that lie within `max_gap_m` of one: part of the observed surface.
     pub cells_bridged: usize,
+    /// Faces between such cells that are farther than `max_gap_m` from every point all the same, in space: marked as filled.
+    pub faces_beyond_points: usize,
     /// Cells in holes narrower than `fill_hole_m` that were filled.
     pub cells_filled: usize,
     /// Cells of side openings that were closed.
@@ -103,9 +111,9 @@ pub(super) fn reconstruct(
     axis: &Axis,
     options: &Options,
 ) -> Option<(Mesh, Summary, WallLine)> {
-    let section = &segmentation.section;
-    let (grid, along_gap) = choose_grid(segmentation, options);
-    let used = segmentation.coordinates.par_iter().zip(&segmentation.class);
+    let (section, coordinates) = (&segmentation.section, &segmentation.coordinates);
+    let (grid, reach) = choose_grid(segmentation, options);
+    let used = coordinates.par_iter().zip(&segmentation.class);
     let (cells, _) =
         CellPoints::sort(&grid, used.map(|(c, class)| class.is_surface().then(|| grid.unroll(section, c))));
     let mut summary = Summary {
@@ -117,7 +125,6 @@ pub(super) fn reconstruct(
     let clusters = choose_clusters(&grid, &cells, &mut summary);
     let clusters = drop_isolated(&grid, clusters, &mut summary);
     let mut places = fit_places(&grid, &cells, &clusters);
-    drop(cells);
     let clusters = drop_bumps(&grid, clusters, &places, &mut summary);
     let depth: Vec<f64> =
         clusters.iter().zip(&places).map(|(c, p)| if c.count > 0 { p.depth } else { f64::NAN }).collect();
@@ -125,16 +132,30 @@ pub(super) fn reconstruct(
     let (grid, open) = (line.grid(), line.open());
     let clusters = cut_openings(&line, section, clusters, &mut places, options.side_openings);
     let mut furniture = vec![false; grid.len()];
-    for (c, _) in segmentation.coordinates.iter().zip(&segmentation.class).filter(|(_, k)| **k == Class::Furniture) {
+    for (c, _) in coordinates.iter().zip(&segmentation.class).filter(|(_, k)| **k == Class::Furniture) {
         if let Some(cell) = grid.cell_at(&grid.unroll(section, c)) {
             furniture[cell] = true;
         }
     }
-    let state = support(grid, &clusters, &places, [&furniture, open], along_gap, options, &mut summary);
+    let state = support(grid, &clusters, &places, [&furniture, open], reach.along_m, options, &mut summary);
     fill_depths(grid, &state, &mut places);
-    // Between profiles whole rows have no points of their own; elsewhere a face needs a measured corner.
-    let profiles = segmentation.sampling.is_profiles();
-    let (mut vertices, faces, observed) = triangulate(grid, &state, &places, profiles, |p| grid.lift(section, axis, p));
+    let space = in_space(grid, &state, &places, |p| grid.lift(section, axis, p));
+    let (mut vertices, faces, observed) = if segmentation.sampling.is_profiles() {
+        // Between profiles whole rows have no points of their own.
+        triangulate(grid, &state, &places, &space, |_| true)
+    } else {
+        let points = PointsNear::new(grid, &cells, &clusters, reach.in_space_m, |i| axis.point_at(&coordinates[i]));
+        let to_points = points.distances(&state, &space);
+        let beyond = AtomicUsize::new(0);
+        let surface = triangulate(grid, &state, &places, &space, |nodes| {
+            let near = points.support(nodes, &space, &to_points);
+            beyond.fetch_add(usize::from(!near), Ordering::Relaxed);
+            near
+        });
+        summary.faces_beyond_points = beyond.into_inner();
+        surface
+    };
+    drop((cells, space));
     let (mut faces, observed) = repair::trim_dangling(faces, observed);
     summary.vertices_split = repair::split_fans(&mut vertices, &mut faces);
     let kept = repair::keep_largest(vertices, faces, observed);
@@ -145,24 +166,44 @@ pub(super) fn reconstruct(
     (!mesh.faces().is_empty()).then_some((mesh, summary, line))
 }
 
-/// The grid and the reach of a point along the axis.
-fn choose_grid(segmentation: &Segmentation, options: &Options) -> (Grid, f64) {
+/// The present nodes in local metres; the others are at the origin.
+fn in_space(grid: &Grid, state: &[Node], places: &[GridPoint], lift: impl Fn(&GridPoint) -> Vec3 + Sync) -> Vec<Vec3> {
+    let node = |n: usize| if state[n] == Node::Absent { Vec3::zeros() } else { lift(&places[n]) };
+    (0..grid.len()).into_par_iter().map(node).collect()
+}
+
+/// How far points speak for the surface, metres.
+#[derive(Clone, Copy, Debug)]
+struct Reach {
+    /// On the grid, along the axis.
+    along_m: f64,
+    /// In space, where the scan is not made of profiles.
+    in_space_m: f64,
+}
+
+/// The grid and the reach of a point.
+fn choose_grid(segmentation: &Segmentation, options: &Options) -> (Grid, Reach) {
     let (section, sampling) = (&segmentation.section, &segmentation.sampling);
     let area = section.mean_perimeter() * (section.end() - section.start());
     let count = segmentation.class.iter().filter(|c| c.is_surface()).count().max(1);
     let even = (area / count as f64).sqrt();
+    let gap_m = options.max_gap_m;
     let column_m = options.spacing_m.unwrap_or_else(|| {
         let wanted = if sampling.is_profiles() { sampling.around_m } else { even } * SPACING_IN_POINT_DISTANCES;
         let finest = if sampling.is_profiles() { FINEST_SHARE_OF_PROFILE } else { FINEST_SHARE_OF_PERIMETER };
         wanted.max(section.mean_perimeter() * finest)
     });
     if !sampling.is_profiles() {
-        return (Grid::new(section, column_m, column_m), options.max_gap_m.max(1.5 * column_m));
+        let apart_m = even * SPACING_IN_POINT_DISTANCES;
+        let in_space_m = if apart_m > gap_m { SPARSE_REACH * apart_m } else { gap_m };
+        let reach = Reach { along_m: gap_m.max(SPARSE_REACH * column_m), in_space_m };
+        return (Grid::new(section, column_m, column_m), reach);
     }
     // Whole rows between the profiles, as many as keep the cells from getting too long.
     let between = (sampling.along_m / (MAX_CELL_ASPECT * column_m)).ceil().max(1.0);
     let row_m = (sampling.along_m / between).max(column_m);
-    (Grid::new(section, row_m, column_m), options.max_gap_m.max(0.8 * sampling.along_m))
+    let along_m = gap_m.max(0.8 * sampling.along_m);
+    (Grid::new(section, row_m, column_m), Reach { along_m, in_space_m: along_m })
 }
 
 /// Finds the side openings without building the surface.
@@ -202,7 +243,6 @@ fn cut_openings(
 mod tests {
     use super::*;
     use crate::mesh::topology;
-    use crate::numeric::Vec3;
     use crate::segment::{self, classify_positions};
     use std::f64::consts::{PI, TAU};
 
@@ -333,6 +373,27 @@ mod tests {
             }
             assert!((m.x - 5.0).hypot(girth + 3.0) > 0.3, "the large hole was filled");
         }
+    }
+
+    #[test]
+    fn observed_surface_has_a_point_within_reach_in_space() {
+        // On the grid a step of 11 cm is one cell wide, in space its middle is more than 5 cm from everything seen.
+        let points = tube(120_000, |s, _| RADIUS + if s > 4.01 { 0.11 } else { 0.0 });
+        let (mesh, summary) = mesh_of(&points, &Options { fill_hole_m: 0.0, ..OPTIONS });
+        let tree = crate::spatial::KdTree::new(&points);
+        let far = |p: &Vec3| tree.nearest(p).unwrap().distance_squared.sqrt();
+        let mut on_the_step = 0;
+        for f in 0..mesh.faces().len() {
+            let [a, b, c] = mesh.corners(f as u32);
+            let middle = (a + b + c) / 3.0;
+            on_the_step += usize::from((3.9..4.1).contains(&middle.x) && !mesh.observed()[f]);
+            if mesh.observed()[f] {
+                let farthest = [a, b, c, middle].iter().map(far).fold(0.0, f64::max);
+                assert!(farthest < 0.05 + 1e-6, "face {f} at {middle}: {farthest}");
+            }
+        }
+        assert!(on_the_step > 100 && summary.faces_beyond_points >= on_the_step, "{on_the_step}");
+        assert_eq!(loops(&mesh), 2);
     }
 
     #[test]

@@ -6,18 +6,13 @@ use crate::mesh::openings::SideOpenings;
 use crate::segment::unrolled_grid::{Grid, GridPoint, squared_distance};
 use rayon::prelude::*;
 
-/// A face between cells without points is observed when they are within this share of `max_gap_m` of one.
-const NEAR_SHARE: f64 = 0.6;
-
 /// State of one node of the grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Node {
     Absent,
     /// Has points.
     Measured,
-    /// Close to points: observed whatever its neighbours are.
-    Near,
-    /// Close enough to points to be observed together with a measured neighbour.
+    /// Close to points.
     Bridged,
     /// In a small hole.
     Filled,
@@ -59,11 +54,7 @@ pub(super) fn support(
                     nearest = nearest.min(dr * dr + dc * dc);
                 }
             }
-            match nearest {
-                d if d <= NEAR_SHARE * NEAR_SHARE => Node::Near,
-                d if d <= 1.0 => Node::Bridged,
-                _ => Node::Absent,
-            }
+            if nearest <= 1.0 { Node::Bridged } else { Node::Absent }
         })
         .collect();
     // Stretch the metric of profile scans, so that a hole counts by its width around the section.
@@ -87,7 +78,7 @@ pub(super) fn support(
     if let Some(inside) = inside {
         state.iter_mut().zip(open).filter(|(_, o)| **o).for_each(|(s, _)| *s = inside);
     }
-    summary.cells_bridged = state.iter().filter(|s| matches!(s, Node::Near | Node::Bridged)).count();
+    summary.cells_bridged = state.iter().filter(|s| **s == Node::Bridged).count();
     summary.cells_filled = state.iter().filter(|s| **s == Node::Filled).count();
     summary.cells_closed = state.iter().filter(|s| **s == Node::Closed).count();
     state

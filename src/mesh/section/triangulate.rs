@@ -6,23 +6,21 @@ use crate::numeric::Vec3;
 use crate::segment::unrolled_grid::{Grid, GridPoint};
 use rayon::prelude::*;
 
-/// Vertices of the present nodes and two triangles for each complete square of them, one for three corners.
+/// The present nodes as vertices, and two triangles for each complete square of them, one for three corners. `space` holds
+/// the nodes in local metres; a face that is not filled counts as observed where `is_near_points` says so of its nodes.
 pub(super) fn triangulate(
     grid: &Grid,
     state: &[Node],
     places: &[GridPoint],
-    profiles: bool,
-    lift: impl Fn(&GridPoint) -> Vec3 + Sync,
+    space: &[Vec3],
+    is_near_points: impl Fn([usize; 3]) -> bool + Sync,
 ) -> (Vec<Vec3>, Vec<[VertexId; 3]>, Vec<bool>) {
     let mut id = vec![VertexId::MAX; grid.len()];
-    let mut present = Vec::new();
-    for (n, s) in state.iter().enumerate() {
-        if *s != Node::Absent {
-            id[n] = present.len() as VertexId;
-            present.push(n);
-        }
+    let mut vertices = Vec::new();
+    for n in (0..grid.len()).filter(|&n| state[n] != Node::Absent) {
+        id[n] = vertices.len() as VertexId;
+        vertices.push(space[n]);
     }
-    let vertices: Vec<Vec3> = present.par_iter().map(|&n| lift(&places[n])).collect();
     let strips: Vec<Vec<([VertexId; 3], bool)>> = (0..grid.rows - 1)
         .into_par_iter()
         .map(|i| {
@@ -39,15 +37,14 @@ pub(super) fn triangulate(
                 let mut add = |corners: [usize; 3]| {
                     if corners.iter().all(|&n| id[n] != VertexId::MAX) {
                         let filled = corners.iter().any(|&n| matches!(state[n], Node::Filled | Node::Closed));
-                        let measured = corners.iter().any(|&n| state[n] == Node::Measured);
-                        let near = corners.iter().all(|&n| state[n] == Node::Near);
-                        out.push((corners.map(|n| id[n]), !filled && (measured || near || profiles)));
+                        let seen = !filled && is_near_points(corners);
+                        out.push((corners.map(|n| id[n]), seen));
                     }
                 };
                 let missing = square.iter().filter(|&&n| id[n] == VertexId::MAX).count();
                 let [a, b, c, d] = square;
                 match missing {
-                    0 if splits_along_ac(grid, places, &vertices, &id, square) => {
+                    0 if splits_along_ac(grid, places, space, square) => {
                         add([a, b, c]);
                         add([a, c, d]);
                     }
@@ -71,7 +68,7 @@ pub(super) fn triangulate(
 }
 
 /// Which diagonal of a square to take: one that keeps both triangles counter-clockwise on the grid, the shorter if both do.
-fn splits_along_ac(grid: &Grid, places: &[GridPoint], vertices: &[Vec3], id: &[VertexId], square: [usize; 4]) -> bool {
+fn splits_along_ac(grid: &Grid, places: &[GridPoint], space: &[Vec3], square: [usize; 4]) -> bool {
     let width = grid.columns as f64;
     let origin = places[square[0]];
     let plane = square.map(|n| {
@@ -87,6 +84,6 @@ fn splits_along_ac(grid: &Grid, places: &[GridPoint], vertices: &[Vec3], id: &[V
     if ac <= 0.0 || bd <= 0.0 {
         return ac > bd;
     }
-    let [a, b, c, d] = square.map(|n| vertices[id[n] as usize]);
+    let [a, b, c, d] = square.map(|n| space[n]);
     (c - a).norm_squared() <= (d - b).norm_squared()
 }
