@@ -59,11 +59,11 @@ impl Need {
     /// As [`io::announce`]: a file is missing, damaged or shorter than its header says.
     pub fn of(files: &[PathBuf], pipeline: &Pipeline) -> Result<Self, super::Error> {
         // Files with poses are read whole.
-        let part = super::run::part_of(pipeline)?.filter(|_| pipeline.ingest.poses.is_none());
+        let part = super::find_axis::part_of(pipeline)?.filter(|_| pipeline.ingest.poses.is_none());
         let told = files.iter().map(|f| io::announce_part(f, part.as_ref()));
         let told: Vec<Announcement> = told.collect::<Result<_, _>>().map_err(super::Error::in_stage("ingest"))?;
         // A file that is no mesh and no scan is told when it is read.
-        let faces_per_point = if super::run::is_mesh(files).unwrap_or(false) { 2.0 } else { FACES_PER_POINT };
+        let faces_per_point = if super::stages::is_mesh(files).unwrap_or(false) { 2.0 } else { FACES_PER_POINT };
         Ok(Self::estimate(&told, faces_per_point, pipeline.mesh.spacing_m, pipeline.map.cell_m))
     }
 

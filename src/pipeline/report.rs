@@ -120,7 +120,7 @@ pub fn schema() -> Value {
     let mut schema = generator.into_root_schema_for::<Report>().to_value();
     schema["title"] = json!("report.json of adit");
     let required = ["ingest", "axis", "mesh", "cut", "unwrap", "map", "profile"];
-    let all = super::run::STAGES.iter().chain(super::run::MESH_STAGES).map(|s| s.name);
+    let all = super::stages::STAGES.iter().chain(super::stages::MESH_STAGES).map(|s| s.name);
     for stage in all {
         schema["properties"][stage] = match stage {
             "profile" => json!({ "allOf": [section, profile] }),
