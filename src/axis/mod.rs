@@ -4,6 +4,7 @@
 
 mod alignment;
 mod enclosed_void;
+mod ends;
 mod sections;
 mod skeleton;
 mod smoothing;
@@ -94,6 +95,18 @@ pub enum Error {
     ClosedLoop {
         /// Length of the shorter way, metres.
         arm_m: f64,
+    },
+    /// The tunnel that was followed does not pass a place where it was to end.
+    #[error(
+        "axis.ends: the tunnel that was followed passes its {} point {away_m:.1} m away, so no tunnel long enough to be followed \
+         leads there; both points must lie in the void of the scan, in its own coordinates (mesh.openings in the report of \
+         the main tunnel lists such points for its side drifts)", ["first", "second"][*which]
+    )]
+    EndNotReached {
+        /// Which of the two, 0 or 1.
+        which: usize,
+        /// How far it is from the axis, metres.
+        away_m: f64,
     },
     /// The alignment file has a line that is no point.
     #[error("line {line} of the alignment is not understood: {problem}")]

@@ -84,8 +84,8 @@ pub struct Settings {
     pub direction_azimuth_deg: Option<f64>,
     /// In a shaft, the azimuth that its crown line faces, degrees clockwise from north. North when not given.
     pub crown_azimuth_deg: Option<f64>,
-    /// Two points `[[x, y, z], [x, y, z]]` in scan coordinates between which to follow a network. The two farthest
-    /// ends when not given.
+    /// Two points `[[x, y, z], [x, y, z]]` in scan coordinates between which to follow a network; a point within a width of
+    /// the tunnel's end means that end. The two farthest ends when not given.
     pub ends: Option<[[f64; 3]; 2]>,
 }
 
@@ -306,6 +306,10 @@ pub fn trace(points: &[Vec3], settings: &Settings) -> Result<(Axis, Summary), Er
     if coverage < LEAST_COVERAGE {
         return Err(not_a_tunnel("too little of any section around the axis has surface", Some(&void), rough.length()));
     }
+    let range = match &ends {
+        Some(ends) => super::ends::between(ends, &refined.axis, range, refined.radius_m)?,
+        None => range,
+    };
     let knots = knots_between(&refined.axis, range, knot_spacing_m);
     let start_chainage = settings.start_chainage_m.unwrap_or(0.0);
     let forwards = Axis::through(&knots, start_chainage)?;

@@ -125,7 +125,7 @@ impl StageError for clean::Error {
 impl StageError for axis::Error {
     fn kind(&self) -> Kind {
         match self {
-            axis::Error::Setting { .. } => Kind::Usage,
+            axis::Error::Setting { .. } | axis::Error::EndNotReached { .. } => Kind::Usage,
             _ => Kind::BadInput,
         }
     }

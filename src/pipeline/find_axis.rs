@@ -38,7 +38,8 @@ pub(super) fn find_axis(
         Some(path) => done("axis", axis::import_csv(&read_alignment("axis", path)?, frame, &settings)),
         None => {
             let traced = axis::trace(points, &settings);
-            let no_tunnel = matches!(traced, Err(axis::Error::NotATunnel { .. } | axis::Error::ClosedLoop { .. }));
+            use axis::Error::{ClosedLoop, EndNotReached, NotATunnel};
+            let no_tunnel = matches!(traced, Err(NotATunnel { .. } | ClosedLoop { .. } | EndNotReached { .. }));
             let result = done("axis", traced);
             match (result, no_tunnel.then(|| plan_view(points)).flatten()) {
                 (Err(error), Some(seen)) => {
