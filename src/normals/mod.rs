@@ -1,10 +1,10 @@
 //! Unit normals that face the void, with the local noise and curvature and a denoised position as by-products.
 //!
-//! Each geometry point gets the plane of its nearest neighbours (`planes`). How many are taken follows the surroundings: from few
-//! to many as long as the points scatter about the plane no more than they did before (averaging noise), and no further
-//! when they begin to (an edge or a bend). In a scan of profiles the neighbours are found in coordinates that are
-//! compressed along the axis, and the plane is fitted as a height over the section's tangent and the axis, because the
-//! relief between two profiles is larger than the piece of profile beside the point.
+//! Each geometry point gets the plane of its nearest neighbours (`planes`). How many are taken follows the
+//! surroundings: from few to many as long as the points scatter about the plane no more than they did before (averaging
+//! noise), and no further when they begin to (an edge or a bend). In a scan of profiles the neighbours are found in
+//! coordinates that are compressed along the axis, and the plane is fitted as a height over the section's tangent and
+//! the axis, because the relief between two profiles is larger than the piece of profile beside the point.
 //!
 //! Orientation: towards the scanner station where it is known, else towards the axis; where that direction is almost
 //! along the surface, neighbours decide.

@@ -3,8 +3,9 @@
 //! Reference: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992,
 //! doi:10.1145/133994.134011 (normal = eigenvector of the smallest eigenvalue of the scatter matrix); surface variation
 //! from M. Pauly, M. Gross, L. P. Kobbelt, "Efficient simplification of point-sampled surfaces", IEEE Visualization
-//! 2002, doi:10.1109/VISUAL.2002.1183771. Eigenvalues in closed form: O. K. Smith, "Eigenvalues of a symmetric 3x3
-//! matrix", CACM 4(4), 1961, doi:10.1145/355578.366316.
+//! 2002, doi:10.1109/VISUAL.2002.1183771. Smallest eigenvalue by Laguerre's method (W. H. Press et al., *Numerical
+//! Recipes*, 3rd edition, 2007, section 9.5.3); where two nearly meet, in closed form: O. K. Smith, "Eigenvalues of a
+//! symmetric 3x3 matrix", CACM 4(4), 1961, doi:10.1145/355578.366316.
 
 use crate::numeric::{Mat3, Vec3};
 
@@ -105,7 +106,7 @@ impl Spread {
 const STEPS: usize = 6;
 /// Steps below this share of the middle eigenvalue are the last: the error left is about the third power.
 const LAST_STEP: f64 = 1e-5;
-/// Slope of the characteristic polynomial at its smallest root, over the squared trace, below which the root is not exact.
+/// Slope of the characteristic polynomial at its smallest root, over the squared trace, below which it is not exact.
 const FLAT_POLYNOMIAL: f64 = 0.01;
 
 /// Ascending eigenvalues of a covariance: a symmetric matrix that has no negative ones.
@@ -115,7 +116,7 @@ fn eigenvalues(matrix: &[f64; 6]) -> [f64; 3] {
     let (minor_x, minor_y, minor_z) = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy);
     let minors = minor_x + minor_y + minor_z;
     let determinant = xx * minor_x - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
-    // Laguerre's method from below the smallest root of the characteristic polynomial; each step triples the digits.
+    // Laguerre's method from below the smallest root of the characteristic polynomial: a step triples the digits.
     let mut smallest = 0.0;
     let mut slope = minors;
     for _ in 0..STEPS {

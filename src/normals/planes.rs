@@ -1,8 +1,8 @@
 //! The plane at every point: over the largest neighbourhood that is still flat.
 //!
 //! The small neighbourhoods are the point's own. The large ones of noisy scans are taken about the middle of up to four
-//! points that follow each other along the curve of the tree: a step aside that is small beside them, for a quarter of the
-//! search. A point that does not lie on their plane, as far as its own neighbourhood tells, keeps its own.
+//! points that follow each other along the curve of the tree: a step aside that is small beside them, for a third of
+//! the search. A point that does not lie on their plane, as far as its own neighbourhood tells, keeps its own.
 
 use super::plane_fit::{Plane, Scatter, Spread};
 use crate::numeric::Vec3;
@@ -147,8 +147,8 @@ mod tests {
         NOISE_M * (0..12).map(|_| random.random_range(-0.5..0.5)).sum::<f64>()
     }
 
-    /// Two squares of 70 cm that meet at a right angle along x, and for each point its true normal and its distance from
-    /// the edge.
+    /// Two plates of 70 cm that meet at a right angle along x; for each point its true normal and its distance from the
+    /// edge.
     fn corner() -> (Vec<Vec3>, Vec<(Vec3, f64)>) {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let point = |random: &mut ChaCha8Rng| {

@@ -3,9 +3,9 @@
 //! Points are sorted along a Morton curve and cut into small bundles, which a binary tree of boxes holds together. All
 //! points of a bundle search together: the radius that sufficed for the bundle before is tried first, the points of
 //! the tree within it are gathered once, as 32-bit offsets from the bundle, and each point of the bundle takes its
-//! nearest from the list by a counting sort (`choice`); where the radius held too few it grows and the point looks again.
-//! The last choice is made with 64-bit distances, so the answers are exact for any distribution; it is fast for points on
-//! surfaces. Who needs no order among the neighbours asks for nested sets of them (`nested`), which is faster.
+//! nearest from the list by a counting sort (`choice`); where the radius held too few it grows and the point looks
+//! again. The last choice is made with 64-bit distances, so the answers are exact for any distribution; it is fast for
+//! points on surfaces. Who needs no order among the neighbours asks for nested sets of them (`nested`): faster.
 //!
 //! Guarantees: neighbours sorted by distance and index, the same on any number of threads.
 //! Reference for the tree over the curve: C. Lauterbach et al., "Fast BVH construction on GPUs", Computer Graphics
@@ -30,8 +30,8 @@ const TASK: usize = 64;
 const FIRST_TRY: f64 = 1.25;
 /// A bundle wider than this many radii is searched point by point: its common list would be long.
 const WIDE: f64 = 4.0;
-/// A place looks first as far as the place before had to, and its squared distance by this much farther, in units of the
-/// share by which numbers of points in equal areas differ.
+/// A position looks first about as far as the one before had to: in squared distance farther by so many statistical
+/// errors of the number of points.
 const FARTHER: f32 = 1.5;
 /// Relative error of squared distances in 32 bits, with a margin.
 const ROUNDING: f32 = 4e-6;
@@ -341,6 +341,8 @@ impl BundleTree {
         self.nodes = parts.pop().expect("at least one part");
     }
 
+    /// Calls `visit` for each of some positions in a run of places, with the place that belongs to it, when `choose`
+    /// has left its nearest points in the list; `visit` tells the squared distance of the farthest.
     fn search(
         &self,
         bundle: std::ops::Range<usize>,
