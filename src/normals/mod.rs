@@ -1,10 +1,10 @@
 //! Unit normals that face the void, with the local noise and curvature and a denoised position as by-products.
 //!
-//! Each geometry point gets the plane of its nearest neighbours. How many are taken follows the surroundings: from few
-//! to many as long as the points scatter about the plane no more than they did before (averaging noise), and no further
-//! when they begin to (an edge or a bend). In a scan of profiles the neighbours are found in coordinates that are
-//! compressed along the axis, and the plane is fitted as a height over the section's tangent and the axis, because the
-//! relief between two profiles is larger than the piece of profile beside the point.
+//! Each geometry point gets the plane of its nearest neighbours (`planes`). How many are taken follows the
+//! surroundings: from few to many as long as the points scatter about the plane no more than they did before (averaging
+//! noise), and no further when they begin to (an edge or a bend). In a scan of profiles the neighbours are found in
+//! coordinates that are compressed along the axis, and the plane is fitted as a height over the section's tangent and
+//! the axis, because the relief between two profiles is larger than the piece of profile beside the point.
 //!
 //! Orientation: towards the scanner station where it is known, else towards the axis; where that direction is almost
 //! along the surface, neighbours decide.
@@ -14,41 +14,29 @@
 
 mod orientation;
 mod plane_fit;
+mod planes;
 mod profiles;
+
+pub use planes::{adaptive, unoriented};
 
 use crate::axis::Axis;
 use crate::clean::{GeometryCloud, Spacing};
 use crate::cloud::Cloud;
 use crate::numeric::Vec3;
 use crate::numeric::statistics::{median, quantile};
-use crate::spatial::Neighbour;
 use crate::spatial::nearest::BundleTree;
 use crate::warning::Warning;
-use plane_fit::{Plane, Scatter};
+use plane_fit::Plane;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-/// Neighbourhoods tried in turn, the point included.
-const NEIGHBOURHOODS: &[usize] = &[14, 28];
-/// The same for a scan whose noise is not small against its spacing.
-const NOISY_NEIGHBOURHOODS: &[usize] = &[18, 32, 64];
-/// Points whose noise decides between the two.
-const NOISE_SAMPLE: usize = 8000;
-/// Noise over spacing from which a scan is noisy in that sense.
-const NOISY: f64 = 0.25;
-/// A larger neighbourhood may scatter more about its plane than the one before by this many standard errors of the
-/// scatter: more means an edge or a bend.
-const MORE_SCATTER_ERRORS: f64 = 1.2;
-/// Middle over largest eigenvalue below which a neighbourhood is a line and says nothing about the surface.
-const LINE: f64 = 0.02;
 
 /// How normals are estimated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Number of nearest neighbours (the point included) for each plane, 4 to 128. 14 or 28
-    /// by noise and edges, or 18 to 64 in noisy scans, when not given.
+    /// by noise and edges, or 18 to 72 in noisy scans, when not given.
     pub neighbours: Option<usize>,
     /// Whether known scanner stations decide which side faces the void (else only the axis does).
     pub use_stations: bool,
@@ -233,7 +221,7 @@ pub fn estimate(
     let estimates = if profiles {
         profiles::estimate(points, axis, &geometry.spacing(), settings.neighbours)
     } else {
-        planes(geometry.tree(), settings.neighbours)
+        planes_of(geometry.tree(), settings.neighbours)
     };
     let mut normals: Vec<Vec3> = estimates.par_iter().map(|e| e.normal).collect();
     let viewpoints = if settings.use_stations { viewpoints } else { Viewpoints::unknown() };
@@ -289,63 +277,10 @@ pub fn estimate(
     Ok((cloud, summary))
 }
 
-/// Unoriented normals of any points, each from the plane of its `neighbours` nearest points (itself included).
-pub fn unoriented(points: &[Vec3], neighbours: usize) -> Vec<Vec3> {
-    normals_of_sizes(&BundleTree::new(points), &[neighbours])
-}
-
-/// Unoriented normals of any points, each from as many neighbours as noise and edges allow (see the module's header).
-pub fn adaptive(points: &[Vec3]) -> Vec<Vec3> {
-    let tree = BundleTree::new(points);
-    let sizes = neighbourhoods(&tree);
-    normals_of_sizes(&tree, sizes)
-}
-
-fn normals_of_sizes(tree: &BundleTree, sizes: &[usize]) -> Vec<Vec3> {
-    let normal =
-        |place: usize, found: &[Neighbour]| plane_of(tree, place, found, sizes).map_or(Vec3::z(), |p| p.0.normal);
-    tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], normal))
-}
-
-fn planes(tree: &BundleTree, neighbours: Option<usize>) -> Vec<Estimate> {
-    let sizes = neighbours.map_or_else(|| neighbourhoods(tree).to_vec(), |k| vec![k]);
-    let estimate =
-        |place: usize, found: &[Neighbour]| from_plane(tree.point(place), plane_of(tree, place, found, &sizes));
-    tree.in_point_order(tree.for_each_place(sizes[sizes.len() - 1], estimate))
-}
-
-/// The neighbourhoods to try, by the noise and the spacing of a sample of the points.
-fn neighbourhoods(tree: &BundleTree) -> &'static [usize] {
-    let sample = tree.for_sample(NOISE_SAMPLE, NEIGHBOURHOODS[NEIGHBOURHOODS.len() - 1], |place, found| {
-        let noise_m = plane_of(tree, place, found, NEIGHBOURHOODS).map_or(0.0, |(plane, _)| plane.noise_m);
-        (noise_m, found.get(1).map_or(0.0, |n| n.distance_squared.sqrt()))
-    });
-    let (mut noises, mut spacings): (Vec<f64>, Vec<f64>) = sample.into_iter().unzip();
-    let noisy = median(&mut noises).unwrap_or(0.0) > NOISY * median(&mut spacings).unwrap_or(0.0);
-    if noisy { NOISY_NEIGHBOURHOODS } else { NEIGHBOURHOODS }
-}
-
-/// The plane over the largest of the given neighbourhoods that is still flat, and how many points that is. Neighbours
-/// are places of the tree.
-fn plane_of(tree: &BundleTree, place: usize, found: &[Neighbour], sizes: &[usize]) -> Option<(Plane, usize)> {
-    let mut scatter = Scatter::about(tree.point(place));
-    let mut chosen: Option<(Plane, usize)> = None;
-    let mut taken = 0;
-    for &size in sizes {
-        let until = size.min(found.len());
-        found[taken..until].iter().for_each(|n| scatter.add(&tree.point(n.index as usize)));
-        taken = until;
-        let Some(plane) = scatter.plane() else { break };
-        let grows = chosen.is_none_or(|(before, count)| {
-            let error = (2.0 * (count as f64 - 3.0).max(1.0)).sqrt().recip();
-            before.roundness < LINE || plane.noise_m <= (1.0 + MORE_SCATTER_ERRORS * error) * before.noise_m
-        });
-        if !grows {
-            break;
-        }
-        chosen = Some((plane, taken));
-    }
-    chosen
+fn planes_of(tree: &BundleTree, neighbours: Option<usize>) -> Vec<Estimate> {
+    let own = neighbours.as_slice();
+    let sizes = if own.is_empty() { planes::neighbourhoods(tree) } else { planes::Sizes { own, shared: &[] } };
+    tree.in_point_order(planes::for_each(tree, sizes, |place, chosen| from_plane(tree.point(place), chosen)))
 }
 
 fn from_plane(point: Vec3, chosen: Option<(Plane, usize)>) -> Estimate {
@@ -365,7 +300,7 @@ fn from_plane(point: Vec3, chosen: Option<(Plane, usize)>) -> Estimate {
         noise_m: plane.noise_m as f32,
         variation: plane.variation as f32,
         neighbours: neighbours as u8,
-        on_a_line: plane.roundness < LINE,
+        on_a_line: plane.roundness < planes::LINE,
     }
 }
 

@@ -15,7 +15,7 @@ pub const STAGES: &[Stage] = &[
     Stage { name: "ingest", version: 1, needs: &[] },
     Stage { name: "clean", version: 2, needs: &["ingest"] },
     Stage { name: "axis", version: 4, needs: &["clean"] },
-    Stage { name: "normals", version: 2, needs: &["ingest", "clean", "axis"] },
+    Stage { name: "normals", version: 3, needs: &["ingest", "clean", "axis"] },
     Stage { name: "segment", version: 6, needs: &["ingest", "clean", "axis"] },
     Stage { name: "mesh", version: 7, needs: &["segment", "normals", "axis"] },
     Stage { name: "cut", version: 2, needs: &["mesh", "axis"] },

@@ -3,16 +3,23 @@
 //! Points are sorted along a Morton curve and cut into small bundles, which a binary tree of boxes holds together. All
 //! points of a bundle search together: the radius that sufficed for the bundle before is tried first, the points of
 //! the tree within it are gathered once, as 32-bit offsets from the bundle, and each point of the bundle takes its
-//! nearest from the list; where the radius held too few it grows and the point looks again. The last choice is made
-//! with 64-bit distances, so the answers are exact for any distribution; it is fast for points on surfaces.
+//! nearest from the list by a counting sort (`choice`); where the radius held too few it grows and the point looks
+//! again. The last choice is made with 64-bit distances, so the answers are exact for any distribution; it is fast for
+//! points on surfaces. Who needs no order among the neighbours asks for nested sets of them (`nested`): faster.
 //!
 //! Guarantees: neighbours sorted by distance and index, the same on any number of threads.
 //! Reference for the tree over the curve: C. Lauterbach et al., "Fast BVH construction on GPUs", Computer Graphics
 //! Forum 28(2), 2009, doi:10.1111/j.1467-8659.2009.01377.x (here cut at jumps of the curve instead of at key bits).
 //! Cost: one sort of integers, and about 0.4 microseconds a point for 16 neighbours.
 
+mod choice;
+mod nested;
+
+pub use nested::Nested;
+
 use super::{Neighbour, VoxelGrid};
 use crate::numeric::Vec3;
+use choice::List;
 use rayon::prelude::*;
 
 /// Most points in a bundle.
@@ -23,12 +30,15 @@ const TASK: usize = 64;
 const FIRST_TRY: f64 = 1.25;
 /// A bundle wider than this many radii is searched point by point: its common list would be long.
 const WIDE: f64 = 4.0;
+/// A position looks first about as far as the one before had to: in squared distance farther by so many statistical
+/// errors of the number of points.
+const FARTHER: f32 = 1.5;
 /// Relative error of squared distances in 32 bits, with a margin.
 const ROUNDING: f32 = 4e-6;
 
 /// Calls `visit(i, neighbours)` for every point `i` with its `count` nearest points (itself included; all of them when
 /// there are fewer), nearest first, and collects the answers in point order. Points must be finite.
-pub fn for_each_neighbourhood<T: Send + Clone>(
+pub fn for_each_neighbourhood<T: Clone + Send + Sync>(
     points: &[Vec3],
     count: usize,
     visit: impl Fn(usize, &[Neighbour]) -> T + Sync,
@@ -44,7 +54,10 @@ struct Box3 {
 
 impl Box3 {
     fn distance_squared(&self, other: &Self) -> f64 {
-        let gap = |axis: usize| (self.low[axis] - other.high[axis]).max(other.low[axis] - self.high[axis]).max(0.0);
+        // Unlike `f64::max` one instruction: no coordinate is NaN.
+        let larger = |a: f64, b: f64| if a > b { a } else { b };
+        let gap =
+            |axis: usize| larger(larger(self.low[axis] - other.high[axis], other.low[axis] - self.high[axis]), 0.0);
         let [x, y, z] = [gap(0), gap(1), gap(2)];
         x * x + y * y + z * z
     }
@@ -81,14 +94,9 @@ struct Search {
     /// Squared radius that the last bundle needed; 0 before the first.
     radius_squared: f64,
     stack: Vec<u32>,
-    /// Gathered points: offsets from the middle of the bundle and places on the curve.
-    x: Vec<f32>,
-    y: Vec<f32>,
-    z: Vec<f32>,
-    at: Vec<u32>,
-    squared: Vec<f32>,
-    /// Squared distance (its bits sort like the number) and number in the list.
-    keys: Vec<u64>,
+    list: List,
+    /// Squared distance within which the last place had what it asked for; 0 before the first.
+    reach_squared: f32,
     found: Vec<Neighbour>,
 }
 
@@ -135,7 +143,11 @@ impl BundleTree {
     }
 
     /// As [`for_each_neighbourhood`].
-    pub fn for_each<T: Send + Clone>(&self, count: usize, visit: impl Fn(usize, &[Neighbour]) -> T + Sync) -> Vec<T> {
+    pub fn for_each<T: Clone + Send + Sync>(
+        &self,
+        count: usize,
+        visit: impl Fn(usize, &[Neighbour]) -> T + Sync,
+    ) -> Vec<T> {
         let id = |place: usize| self.order[place];
         self.in_point_order(self.answers(count, &id, |place, found| visit(self.order[place] as usize, found)))
     }
@@ -188,11 +200,11 @@ impl BundleTree {
     }
 
     /// Values along the curve, put into the order of the points.
-    pub fn in_point_order<T: Clone + Send>(&self, along_curve: Vec<T>) -> Vec<T> {
+    pub fn in_point_order<T: Clone + Send + Sync>(&self, along_curve: Vec<T>) -> Vec<T> {
         if self.ordered {
             return along_curve;
         }
-        self.places().into_iter().map(|at| along_curve[at as usize].clone()).collect()
+        self.places().into_par_iter().map(|at| along_curve[at as usize].clone()).collect()
     }
 
     /// Place on the curve of each point.
@@ -228,8 +240,12 @@ impl BundleTree {
         if count == 0 {
             return (0..self.order.len()).map(|place| visit(place, &[])).collect();
         }
-        let answers: Vec<Vec<T>> =
-            self.bundles.par_chunks(TASK).map(|bundles| self.answer(bundles, count, id, &visit)).collect();
+        self.tasks(|bundles| self.answer(bundles, count, id, &visit))
+    }
+
+    /// Answers of all tasks, in the order of the curve.
+    fn tasks<T: Send>(&self, task: impl Fn(&[(u32, u32)]) -> Vec<T> + Sync) -> Vec<T> {
+        let answers: Vec<Vec<T>> = self.bundles.par_chunks(TASK).map(&task).collect();
         let mut all = Vec::with_capacity(self.order.len());
         answers.into_iter().for_each(|part| all.extend(part));
         all
@@ -245,8 +261,12 @@ impl BundleTree {
         let mut search = Search::default();
         let mut answers = Vec::with_capacity(bundles.len() * BUNDLE);
         for &(start, end) in bundles {
-            self.search(start as usize..end as usize, count.min(self.order.len()), id, &mut search, |at, found| {
-                answers.push(visit(at, found));
+            let count = count.min(self.order.len());
+            let places = (start as usize..end as usize).map(|at| (at, self.point(at)));
+            self.search(start as usize..end as usize, places, count, &mut search, |at, _, search| {
+                self.sort(at, count, id, search);
+                answers.push(visit(at, &search.found));
+                search.found.last().map_or(0.0, |n| n.distance_squared)
             });
         }
         answers
@@ -321,13 +341,15 @@ impl BundleTree {
         self.nodes = parts.pop().expect("at least one part");
     }
 
+    /// Calls `visit` for each of some positions in a run of places, with the place that belongs to it, when `choose`
+    /// has left its nearest points in the list; `visit` tells the squared distance of the farthest.
     fn search(
         &self,
         bundle: std::ops::Range<usize>,
+        positions: impl Iterator<Item = (usize, Vec3)>,
         count: usize,
-        id: &impl Fn(usize) -> u32,
         search: &mut Search,
-        mut visit: impl FnMut(usize, &[Neighbour]),
+        mut visit: impl FnMut(usize, &Vec3, &mut Search) -> f64,
     ) {
         if search.radius_squared <= 0.0 {
             search.radius_squared = self.first_radius_squared(bundle.start, count);
@@ -342,22 +364,21 @@ impl BundleTree {
             self.gather(&own, radius_squared, search);
         }
         let mut needed = 0.0f64;
-        for at in bundle {
+        for (at, p) in positions {
             // Points of a wide bundle have a list of their own and start anew.
-            let from = if wide { Box3 { low: self.point(at), high: self.point(at) } } else { own };
+            let from = if wide { Box3 { low: p, high: p } } else { own };
             let mut tried = if wide { search.radius_squared * FIRST_TRY } else { radius_squared };
             if wide {
                 self.gather(&from, tried, search);
             }
-            while !self.choose(at, &from, tried, count, id, search) {
+            while !self.choose(&p, &from, tried, count, search) {
                 // The emptier the surroundings turn out to be, the more the radius grows.
-                let share = count as f64 / search.keys.len().max(1) as f64;
+                let share = count as f64 / search.list.near.len().max(1) as f64;
                 tried *= (1.3 * share).clamp(1.5, 16.0);
                 self.gather(&from, tried, search);
             }
             radius_squared = tried;
-            visit(at, &search.found);
-            needed = needed.max(search.found.last().map_or(0.0, |n| n.distance_squared));
+            needed = needed.max(visit(at, &p, search));
         }
         // A lone point must not make its successors gather half the cloud.
         let before = search.radius_squared;
@@ -377,9 +398,8 @@ impl BundleTree {
 
     /// Collects the points of all bundles that come within the radius of a box.
     fn gather(&self, own: &Box3, radius_squared: f64, search: &mut Search) {
-        let Search { stack, x, y, z, at, .. } = search;
-        [&mut *x, &mut *y, &mut *z].into_iter().for_each(Vec::clear);
-        at.clear();
+        let Search { stack, list, .. } = search;
+        list.clear();
         let middle = (own.low + own.high) / 2.0;
         let reach = radius_squared.sqrt() * (1.0 + 1e-6);
         let (low, high) = (own.low.add_scalar(-reach), own.high.add_scalar(reach));
@@ -395,85 +415,62 @@ impl BundleTree {
                 stack.push(node + 1);
                 continue;
             }
-            // Written first, kept if inside: no branch to guess.
             let (start, end) = (n.start as usize, n.end as usize);
-            let mut next = at.len();
-            for list in [&mut *x, &mut *y, &mut *z] {
-                list.resize(next + end - start, 0.0);
+            let points = self.x[start..end].iter().zip(&self.y[start..end]).zip(&self.z[start..end]);
+            let mut kept = ([0.0f32; BUNDLE], [0.0f32; BUNDLE], [0.0f32; BUNDLE], [0u32; BUNDLE]);
+            let mut count = 0;
+            // Written first, kept if inside: no branch to guess.
+            for (k, ((&px, &py), &pz)) in points.enumerate() {
+                let slot = count % BUNDLE;
+                kept.0[slot] = (px - middle.x) as f32;
+                kept.1[slot] = (py - middle.y) as f32;
+                kept.2[slot] = (pz - middle.z) as f32;
+                kept.3[slot] = (start + k) as u32;
+                let inside = (px >= low.x) & (px <= high.x) & (py >= low.y);
+                count += usize::from(inside & (py <= high.y) & (pz >= low.z) & (pz <= high.z));
             }
-            at.resize(next + end - start, 0);
-            for k in start..end {
-                let p = [self.x[k], self.y[k], self.z[k]];
-                x[next] = (p[0] - middle.x) as f32;
-                y[next] = (p[1] - middle.y) as f32;
-                z[next] = (p[2] - middle.z) as f32;
-                at[next] = k as u32;
-                let inside = (p[0] >= low.x) & (p[0] <= high.x) & (p[1] >= low.y);
-                next += usize::from(inside & (p[1] <= high.y) & (p[2] >= low.z) & (p[2] <= high.z));
-            }
-            for list in [&mut *x, &mut *y, &mut *z] {
-                list.truncate(next);
-            }
-            at.truncate(next);
+            let count = count.min(BUNDLE);
+            list.x.extend_from_slice(&kept.0[..count]);
+            list.y.extend_from_slice(&kept.1[..count]);
+            list.z.extend_from_slice(&kept.2[..count]);
+            list.at.extend_from_slice(&kept.3[..count]);
         }
     }
 
-    /// Finds the nearest of the gathered points, exactly; false when there are fewer than `count` within the radius.
-    /// Leaves the number of points within the radius in `search.keys`.
-    fn choose(
-        &self,
-        at: usize,
-        own: &Box3,
-        radius_squared: f64,
-        count: usize,
-        id: &impl Fn(usize) -> u32,
-        search: &mut Search,
-    ) -> bool {
-        let Search { x, y, z, at: places, squared, keys, found, .. } = search;
-        let p = self.point(at);
+    /// Brings the `count` nearest of the gathered points to the front of `list.near`; false when there are fewer within
+    /// the radius, or when 32 bits do not tell. See [`List::settle`].
+    fn choose(&self, p: &Vec3, own: &Box3, radius_squared: f64, count: usize, search: &mut Search) -> bool {
+        let Search { list, reach_squared, .. } = search;
         let middle = (own.low + own.high) / 2.0;
-        let q = [(p.x - middle.x) as f32, (p.y - middle.y) as f32, (p.z - middle.z) as f32];
-        squared.clear();
-        squared.extend(x.iter().zip(y.iter()).zip(z.iter()).map(|((x, y), z)| {
-            let (dx, dy, dz) = (x - q[0], y - q[1], z - q[2]);
-            dx * dx + dy * dy + dz * dz
-        }));
+        list.measure([(p.x - middle.x) as f32, (p.y - middle.y) as f32, (p.z - middle.z) as f32]);
         // Offsets are rounded relative to the size of the list, distances relative to themselves.
         let size = (own.high - own.low).norm() + radius_squared.sqrt();
         let slack = (ROUNDING as f64 * size) as f32;
-        let limit = radius_squared as f32;
-        let everything = places.len() == self.order.len();
-        keys.clear();
-        keys.resize(squared.len(), 0);
-        let mut inside = 0;
-        for (number, &s) in squared.iter().enumerate() {
-            keys[inside] = u64::from(s.to_bits()) << 32 | number as u64;
-            inside += usize::from(s <= limit || everything);
-        }
-        keys.truncate(inside);
-        if inside < count {
-            return false;
-        }
-        let nth = |keys: &mut Vec<u64>| f32::from_bits((*keys.select_nth_unstable(count - 1).1 >> 32) as u32);
-        let worst = nth(keys);
-        // Everything that 32 bits cannot tell from the last one is kept for the choice with 64 bits.
-        let doubtful = (worst.sqrt() + slack).powi(2) * (1.0 + ROUNDING);
-        if doubtful > limit && !everything {
-            return false;
-        }
-        let near = {
-            let mut near = 0;
-            for i in 0..keys.len() {
-                let key = keys[i];
-                keys[near] = key;
-                near += usize::from(f32::from_bits((key >> 32) as u32) <= doubtful);
+        let everything = list.at.len() == self.order.len();
+        let most = if everything { f32::INFINITY } else { radius_squared as f32 };
+        let first = *reach_squared * (1.0 + FARTHER / (count as f32).sqrt());
+        for limit in [first, most] {
+            if limit <= most && list.within(limit) >= count {
+                list.rank(limit);
+                // Everything that 32 bits cannot tell from the last one is within reach too.
+                let reach = (list.settle(count).sqrt() + slack).powi(2) * (1.0 + ROUNDING);
+                if reach <= limit {
+                    *reach_squared = reach;
+                    return true;
+                }
             }
-            &mut keys[..near]
-        };
-        near.sort_unstable();
+        }
+        false
+    }
+
+    /// The exact choice among what [`Self::choose`] left, into `search.found`.
+    fn sort(&self, at: usize, count: usize, id: &impl Fn(usize) -> u32, search: &mut Search) {
+        let p = self.point(at);
+        let Search { list, reach_squared, found, .. } = search;
+        list.sort();
         found.clear();
-        for &key in near.iter() {
-            let k = places[key as u32 as usize] as usize;
+        for &number in list.near.iter().take_while(|&&number| list.squared[number as usize] <= *reach_squared) {
+            let k = list.at[number as usize] as usize;
             let (dx, dy, dz) = (self.x[k] - p.x, self.y[k] - p.y, self.z[k] - p.z);
             let new = Neighbour { index: id(k), distance_squared: dx * dx + dy * dy + dz * dz };
             // In order but for the last bits: insertion costs one comparison for nearly all.
@@ -486,7 +483,6 @@ impl BundleTree {
             found[slot] = new;
         }
         found.truncate(count);
-        true
     }
 }
 
@@ -495,59 +491,4 @@ fn by_distance(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::spatial::KdTree;
-    use rand::{Rng, SeedableRng};
-
-    fn assert_same_as_the_tree(points: &[Vec3], count: usize) {
-        let tree = KdTree::new(points);
-        let all = for_each_neighbourhood(points, count, |_, found| found.to_vec());
-        for (i, found) in all.iter().enumerate() {
-            let wanted = tree.nearest_n(&points[i], count);
-            assert_eq!(found.len(), wanted.len());
-            for (a, b) in found.iter().zip(&wanted) {
-                assert!((a.distance_squared - b.distance_squared).abs() <= 1e-12 * (1.0 + b.distance_squared));
-            }
-            assert!(found.windows(2).all(|w| by_distance(&w[0], &w[1]).is_lt()));
-        }
-    }
-
-    /// Searches one by one find what the search of all finds, whether the points come in order or not.
-    fn assert_single_searches_agree(points: &[Vec3]) {
-        let some: Vec<usize> = (0..points.len()).step_by(37).collect();
-        let all = for_each_neighbourhood(points, 9, |_, found| found.to_vec());
-        for tree in [BundleTree::new(points), BundleTree::of_ordered(points)] {
-            let places = tree.places_of(&some);
-            assert!(some.iter().zip(places).all(|(&i, place)| tree.nearest(place, 9) == all[i]));
-        }
-    }
-
-    #[test]
-    fn agrees_with_the_tree() {
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(8);
-        let cylinder: Vec<Vec3> = (0..3000)
-            .map(|_| {
-                let a: f64 = random.random_range(0.0..std::f64::consts::TAU);
-                Vec3::new(random.random_range(0.0..20.0), 3.0 * a.cos(), 3.0 * a.sin())
-            })
-            .collect();
-        let profiles: Vec<Vec3> =
-            (0..3000).map(|i| Vec3::new((i / 300) as f64, (i % 300) as f64 * 0.01, 0.0)).collect();
-        let mut with_outliers = cylinder.clone();
-        with_outliers.extend((0..20).map(|i| Vec3::new(1000.0 * i as f64, -500.0, 40.0)));
-        let same = vec![Vec3::new(1.0, 1.0, 1.0); 200];
-        for points in [cylinder, profiles, with_outliers, same] {
-            assert_single_searches_agree(&points);
-            assert_same_as_the_tree(&points, 16);
-            assert_same_as_the_tree(&points[..points.len().min(40)], 64);
-        }
-    }
-
-    #[test]
-    fn few_or_no_points() {
-        assert!(for_each_neighbourhood(&[], 5, |_, n| n.len()).is_empty());
-        assert!(BundleTree::new(&[Vec3::zeros(), Vec3::x()]).nearest(1, 0).is_empty());
-        assert_eq!(for_each_neighbourhood(&[Vec3::zeros(), Vec3::x()], 5, |_, n| n.len()), [2, 2]);
-    }
-}
+mod tests;
