@@ -314,27 +314,13 @@ fn tiles_of(description: &LayerDescription, piece: &Piece, layer: usize) -> Vec<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::ScanFrame;
-    use crate::map::example::flat_chart;
-    use crate::map::{DrawInput, Layer, Settings, draw};
+    use crate::io::example::draw_sloping_map;
+    use crate::map::{Layer, Settings};
 
     #[test]
     fn pictures_rasters_and_palette_of_a_map() {
         let folder = tempfile::tempdir().unwrap();
-        let chart = flat_chart(13.0, 3.1, 30, 10);
-        let section: Vec<f64> = chart.uv().iter().map(|p| 0.02 * (p.x - 6.5)).collect();
-        let frame = ScanFrame::local();
-        let input = DrawInput {
-            chart: &chart,
-            points: None,
-            frame: &frame,
-            section_offsets_m: Some(&section),
-            design_offsets_m: None,
-            quality: None,
-        };
-        let settings = Settings { cell_m: Some(0.01), ..Default::default() };
-        let mut sink = MapFolder::new(folder.path());
-        let summary = draw(&input, &settings, &mut sink).unwrap();
+        let summary = draw_sloping_map(folder.path(), &Settings { cell_m: Some(0.01), ..Default::default() });
         assert_eq!(summary.layers, [Layer::Labels, Layer::Offset, Layer::Coverage, Layer::Distortion, Layer::Relief]);
         let picture = image::open(folder.path().join("offset.png")).unwrap().into_rgba8();
         assert_eq!(picture.dimensions(), (1300, 310));

@@ -10,6 +10,8 @@ mod detect;
 pub mod drawing;
 mod e57;
 mod error;
+#[cfg(test)]
+mod example;
 mod file_scan;
 pub mod geotiff;
 mod guards;

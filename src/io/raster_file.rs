@@ -228,27 +228,13 @@ impl Samples {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::ScanFrame;
-    use crate::io::MapFolder;
-    use crate::map::example::flat_chart;
-    use crate::map::{DrawInput, Layer, Legend, Settings, draw};
+    use crate::io::example::draw_sloping_map;
+    use crate::map::{Layer, Legend, Settings};
 
     #[test]
     fn parts_of_every_resolution_come_back() {
         let folder = tempfile::tempdir().unwrap();
-        let chart = flat_chart(13.0, 3.1, 30, 10);
-        let section: Vec<f64> = chart.uv().iter().map(|p| 0.02 * (p.x - 6.5)).collect();
-        let frame = ScanFrame::local();
-        let input = DrawInput {
-            chart: &chart,
-            points: None,
-            frame: &frame,
-            section_offsets_m: Some(&section),
-            design_offsets_m: None,
-            quality: None,
-        };
-        let settings = Settings { cell_m: Some(0.01), ..Default::default() };
-        draw(&input, &settings, &mut MapFolder::new(folder.path())).unwrap();
+        draw_sloping_map(folder.path(), &Settings { cell_m: Some(0.01), ..Default::default() });
         let mut file = RasterFile::open(&folder.path().join("offset.tif")).unwrap();
         assert_eq!((file.size(0), file.size(1)), ((1300, 310), (650, 155)));
         assert_eq!((file.level_for(0.02), file.level_for(0.019), file.level_for(0.001)), (1, 0, 0));

@@ -154,28 +154,14 @@ fn encode(tile: &Tile) -> io::Result<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::ScanFrame;
-    use crate::io::MapFolder;
-    use crate::map::example::flat_chart;
-    use crate::map::{DrawInput, Layer, Settings, draw};
+    use crate::io::example::draw_sloping_map;
+    use crate::map::{Layer, Settings};
 
     #[test]
     fn tiles_hold_the_picture_at_every_zoom() {
         let folder = tempfile::tempdir().unwrap();
-        let chart = flat_chart(13.0, 3.1, 30, 10);
-        let section: Vec<f64> = chart.uv().iter().map(|p| 0.02 * (p.x - 6.5)).collect();
-        let frame = ScanFrame::local();
-        let input = DrawInput {
-            chart: &chart,
-            points: None,
-            frame: &frame,
-            section_offsets_m: Some(&section),
-            design_offsets_m: None,
-            quality: None,
-        };
         let settings = Settings { cell_m: Some(0.01), layers: vec![Layer::Offset], tiles: true, ..Default::default() };
-        let mut sink = MapFolder::new(folder.path()).with_tiles(settings.tiles);
-        draw(&input, &settings, &mut sink).unwrap();
+        draw_sloping_map(folder.path(), &settings);
         // 1300 x 310 pixels: 6 x 2 tiles, 3 x 1, 2 x 1, 1 x 1.
         let whole = image::open(folder.path().join("offset.png")).unwrap().into_rgba8();
         let tile = |z: u32, x: u32, y: u32| {
