@@ -7,7 +7,7 @@ use crate::segment::unrolled_grid::{CellPoints, Grid, GridPoint};
 use rayon::prelude::*;
 
 /// How far a vertex may move from the middle of its cell, in cells.
-const MAX_SHIFT: f64 = 0.3;
+pub(super) const MAX_SHIFT: f64 = 0.3;
 /// Width of the fitting weights, in cells.
 const FIT_SIGMA: f64 = 0.7;
 

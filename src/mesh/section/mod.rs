@@ -137,7 +137,7 @@ pub(super) fn reconstruct(
             furniture[cell] = true;
         }
     }
-    let state = support(grid, &clusters, &places, [&furniture, open], reach.along_m, options, &mut summary);
+    let state = support(grid, &clusters, &mut places, [&furniture, open], reach, options, &mut summary);
     fill_depths(grid, &state, &mut places);
     let space = in_space(grid, &state, &places, |p| grid.lift(section, axis, p));
     let (mut vertices, faces, observed) = if segmentation.sampling.is_profiles() {
@@ -177,7 +177,7 @@ fn in_space(grid: &Grid, state: &[Node], places: &[GridPoint], lift: impl Fn(&Gr
 struct Reach {
     /// On the grid, along the axis.
     along_m: f64,
-    /// In space, where the scan is not made of profiles.
+    /// In space; without limit in scans of profiles, between which whole rows of cells have no points.
     in_space_m: f64,
 }
 
@@ -203,7 +203,7 @@ fn choose_grid(segmentation: &Segmentation, options: &Options) -> (Grid, Reach) 
     let between = (sampling.along_m / (MAX_CELL_ASPECT * column_m)).ceil().max(1.0);
     let row_m = (sampling.along_m / between).max(column_m);
     let along_m = gap_m.max(0.8 * sampling.along_m);
-    (Grid::new(section, row_m, column_m), Reach { along_m, in_space_m: along_m })
+    (Grid::new(section, row_m, column_m), Reach { along_m, in_space_m: f64::INFINITY })
 }
 
 /// Finds the side openings without building the surface.
