@@ -66,6 +66,10 @@ pub fn import_csv(text: &str, frame: &ScanFrame, settings: &Settings) -> Result<
     let start = settings.start_chainage_m.or(chainages.first().copied()).unwrap_or(0.0);
     let axis = imported_direction(Axis::through(&points, start)?, settings);
     let mut warnings = Vec::new();
+    if settings.ends.is_some() {
+        let message = "axis.ends was ignored: axis.alignment says where the tunnel begins and ends";
+        warnings.push(Warning::new("ends-unused", message));
+    }
     if let (Some(first), Some(last)) = (chainages.first(), chainages.last()) {
         let stated = last - first;
         if (stated - axis.length()).abs() > CHAINAGE_TOLERANCE * axis.length() {
@@ -153,6 +157,14 @@ mod tests {
         let (axis, summary) = import("120 1000 2000 5\n100 1010 2000 5\n").unwrap();
         assert!((axis.frame_at(100.0).forward + Vec3::x()).norm() < 1e-9);
         assert_eq!(summary.warnings[0].code, "alignment-chainage");
+    }
+
+    #[test]
+    fn ends_beside_an_alignment_are_told_to_be_unused() {
+        let settings = Settings { ends: Some([[1000.0, 2000.0, 5.0], [1010.0, 2000.0, 5.0]]), ..Settings::default() };
+        let frame = ScanFrame::with_origin(Vec3::zeros());
+        let (_, summary) = import_csv("x,y,z\n1000,2000,5\n1010,2000,5\n", &frame, &settings).unwrap();
+        assert_eq!(summary.warnings[0].code, "ends-unused");
     }
 
     #[test]

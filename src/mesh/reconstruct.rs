@@ -49,7 +49,8 @@ pub struct Settings {
     /// 1/600 of the tunnel's perimeter.
     pub spacing_m: Option<f64>,
     /// Surface farther than this from the nearest point is not observed, metres (profile scans: this is the limit
-    /// around the section; along the axis the distance between profiles is bridged).
+    /// around the section; along the axis the distance between profiles is bridged). Where points lie farther apart, the
+    /// report tells the reach that was used.
     pub max_gap_m: f64,
     /// Holes narrower than this are filled and marked as filled, metres; 0 fills none.
     pub fill_hole_m: f64,

@@ -5,6 +5,7 @@ use super::line::done;
 use super::plan_view::plan_view;
 use super::products::cannot_write;
 use super::settings::Pipeline;
+use crate::axis::Error::{ClosedLoop, EndNotReached, NotATunnel};
 use crate::axis::{self, Axis};
 use crate::cloud::ScanFrame;
 use crate::numeric::Vec3;
@@ -38,7 +39,6 @@ pub(super) fn find_axis(
         Some(path) => done("axis", axis::import_csv(&read_alignment("axis", path)?, frame, &settings)),
         None => {
             let traced = axis::trace(points, &settings);
-            use axis::Error::{ClosedLoop, EndNotReached, NotATunnel};
             let no_tunnel = matches!(traced, Err(NotATunnel { .. } | ClosedLoop { .. } | EndNotReached { .. }));
             let result = done("axis", traced);
             match (result, no_tunnel.then(|| plan_view(points)).flatten()) {

@@ -416,6 +416,7 @@ impl BundleTree {
                 continue;
             }
             let (start, end) = (n.start as usize, n.end as usize);
+            debug_assert!(end - start <= BUNDLE, "more would not fit into `kept`");
             let points = self.x[start..end].iter().zip(&self.y[start..end]).zip(&self.z[start..end]);
             let mut kept = ([0.0f32; BUNDLE], [0.0f32; BUNDLE], [0.0f32; BUNDLE], [0u32; BUNDLE]);
             let mut count = 0;

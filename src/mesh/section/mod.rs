@@ -9,8 +9,9 @@
 //! A plane is fitted to the cluster and its neighbours by weighted least squares with a robust second round (moving least
 //! squares, D. Levin, "The approximation power of moving least-squares", Math. Comp. 67, 1998,
 //! doi:10.1090/S0025-5718-98-00974-0), and evaluated at the cluster's centroid. Cells without points but within
-//! `max_gap_m` of one belong to the observed surface; narrower gaps than `fill_hole_m` (a morphological closing) are
-//! filled and marked as such; both get their depth from a thin plate through the neighbours. Over a side opening that is to be
+//! `max_gap_m` of one are bridged, gaps narrower than `fill_hole_m` (a morphological closing) are filled; both get their
+//! depth from a thin plate through the neighbours. Observed is what has a point within reach in space as well, all else is
+//! marked as filled. Over a side opening that is to be
 //! closed, lines along the tunnel run straight from the wall before it to the wall after it. Four neighbouring cells make two
 //! triangles.
 //!
@@ -20,7 +21,7 @@
 //! | `d` | depth: distance from the axis minus mean radius, positive into the rock |
 //!
 //! Guarantees: oriented manifold, faces counter-clockwise in (chainage, girth), no face wider than the cells it spans,
-//! same bytes on any number of threads. Cost: linear in points and cells; 24 bytes a point and 60 a cell.
+//! same bytes on any number of threads. Cost: linear in points and cells; 60 bytes a point and 90 a cell.
 
 mod clusters;
 mod fit;
@@ -89,9 +90,12 @@ pub struct Summary {
     pub bumps_dropped: usize,
     /// Share of cells with points at two or more clearly different depths, percent.
     pub multiple_depth_percent: f64,
-    /// Cells without points that lie within `max_gap_m` of one: part of the observed surface.
+    /// How far from a point surface counts as observed, metres: `max_gap_m`, or more where the points themselves lie farther
+    /// apart. `None` for profile scans, whose profiles are bridged.
+    pub reach_m: Option<f64>,
+    /// Cells without points that lie within reach of one on the grid.
     pub cells_bridged: usize,
-    /// Faces between such cells that are farther than `max_gap_m` from every point all the same, in space: marked as filled.
+    /// Faces between cells with points and such cells that are beyond reach all the same, in space: marked as filled.
     pub faces_beyond_points: usize,
     /// Cells in holes narrower than `fill_hole_m` that were filled.
     pub cells_filled: usize,
@@ -119,6 +123,7 @@ pub(super) fn reconstruct(
     let mut summary = Summary {
         spacing_m: grid.column_m,
         spacing_along_m: grid.row_m,
+        reach_m: Some(reach.in_space_m).filter(|m| m.is_finite()),
         points_used: cells.len(),
         ..Summary::default()
     };
@@ -244,6 +249,7 @@ mod tests {
     use super::*;
     use crate::mesh::topology;
     use crate::segment::{self, classify_positions};
+    use rand::{Rng, SeedableRng};
     use std::f64::consts::{PI, TAU};
 
     const RADIUS: f64 = 2.0;
@@ -394,6 +400,25 @@ mod tests {
         }
         assert!(on_the_step > 100 && summary.faces_beyond_points >= on_the_step, "{on_the_step}");
         assert_eq!(loops(&mesh), 2);
+    }
+
+    #[test]
+    fn sparse_points_keep_their_reach_and_say_so() {
+        // 4 cm apart by chance: two cells of 5 cm in ten have no point.
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(11);
+        let points: Vec<Vec3> = (0..62_000)
+            .map(|_| {
+                let (s, a) = (random.random_range(0.0..LENGTH), random.random_range(0.0..TAU));
+                Vec3::new(s, RADIUS * a.sin(), RADIUS * a.cos())
+            })
+            .collect();
+        let (mesh, summary) = mesh_of(&points, &Options { fill_hole_m: 0.0, ..OPTIONS });
+        let observed = mesh.observed().iter().filter(|o| **o).count() as f64 / mesh.observed().len() as f64;
+        println!("OBS {observed} {:?} {}", summary.reach_m, summary.faces_beyond_points);
+        assert_eq!(summary.reach_m, Some(0.05));
+        let points = tube(10_000, |_, _| RADIUS);
+        let (_, summary) = mesh_of(&points, &Options { spacing_m: None, ..OPTIONS });
+        assert!((summary.reach_m.unwrap() - 0.18).abs() < 0.01, "{:?}", summary.reach_m);
     }
 
     #[test]
