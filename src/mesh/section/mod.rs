@@ -415,7 +415,7 @@ mod tests {
         let (mesh, summary) = mesh_of(&points, &Options { fill_hole_m: 0.0, ..OPTIONS });
         let filled = mesh.observed().iter().filter(|o| !**o).count();
         // 1851 if bridged nodes beyond the reach did not lean towards the points.
-        assert!(filled >= 100 && filled < 1000, "{filled} of {}", mesh.faces().len());
+        assert!((100..1000).contains(&filled), "{filled} of {}", mesh.faces().len());
         assert_eq!(summary.reach_m, Some(0.05));
         let points = tube(10_000, |_, _| RADIUS);
         let (_, summary) = mesh_of(&points, &Options { spacing_m: None, ..OPTIONS });
